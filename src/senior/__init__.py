@@ -1,0 +1,74 @@
+"""SENIOR: teach robots by preference.
+
+    from senior import preset, train, evaluate_run
+    results = train(preset("quick", "door-close", "m-senior"), out="runs/first")
+    print(evaluate_run(results[0].path, episodes=50).success_rate)
+
+Names are imported when they are first used, so that ``import senior`` is cheap.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from senior.config import Config
+    from senior.methods import METHODS, Method
+    from senior.presets import preset
+    from senior.program import Judgement, Quiet, Result, evaluate_run, resume, train
+    from senior.schedule import plan
+    from senior.select import Context, Selection
+    from senior.types import Answers, BadInput, EnvSpec, Pairs, Query
+
+_HOME = {
+    "METHODS": "methods",
+    "Answers": "types",
+    "BadInput": "types",
+    "Config": "config",
+    "Context": "select",
+    "EnvSpec": "types",
+    "Judgement": "program",
+    "Method": "methods",
+    "Pairs": "types",
+    "Query": "types",
+    "Quiet": "program",
+    "Result": "program",
+    "Selection": "select",
+    "evaluate_run": "program",
+    "plan": "schedule",
+    "preset": "presets",
+    "resume": "program",
+    "train": "program",
+}
+
+__all__ = [
+    "METHODS",
+    "Answers",
+    "BadInput",
+    "Config",
+    "Context",
+    "EnvSpec",
+    "Judgement",
+    "Method",
+    "Pairs",
+    "Query",
+    "Quiet",
+    "Result",
+    "Selection",
+    "evaluate_run",
+    "plan",
+    "preset",
+    "resume",
+    "train",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'senior' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"senior.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

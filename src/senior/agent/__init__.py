@@ -1,0 +1,1 @@
+"""The policy and its critics: pure functions of one run."""

@@ -1,0 +1,63 @@
+"""Multilayer perceptrons as plain pytrees of arrays, with the two initialisations that the field's results rest on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+Tree = TypeVar("Tree")
+Initialiser = Callable[[PRNGKeyArray, int, int], tuple[Array, Array]]
+Activation = Callable[[Array], Array]
+
+adam = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-8)
+"""Adam without its learning rate, which is a traced number of the run (see `descend`)."""
+
+
+class MLP(NamedTuple):
+    """Weights ``[in, out]`` and biases ``[out]`` per layer; an ensemble has one more axis in front of both."""
+
+    weights: tuple[Array, ...]
+    biases: tuple[Array, ...]
+
+
+def orthogonal(key: PRNGKeyArray, size_in: int, size_out: int) -> tuple[Array, Array]:
+    """Orthogonal weights with gain 1, zero biases: every layer of SAC in PEBBLE's line of work."""
+    return jax.nn.initializers.orthogonal()(key, (size_in, size_out)), jnp.zeros(size_out)
+
+
+def fan_in_uniform(key: PRNGKeyArray, size_in: int, size_out: int) -> tuple[Array, Array]:
+    """Weights and biases uniform in +-1/sqrt(fan in): PyTorch's default linear layer, used by the reward models."""
+    bound = size_in**-0.5
+    draw = jax.random.uniform(key, (size_in + 1, size_out), minval=-bound, maxval=bound)
+    return draw[:-1], draw[-1]
+
+
+def init_mlp(
+    key: PRNGKeyArray, size_in: int, layers: int, width: int, size_out: int, initialiser: Initialiser
+) -> MLP:
+    """A perceptron with ``layers`` hidden layers of ``width`` units."""
+    sizes = [size_in, *[width] * layers, size_out]
+    keys = jax.random.split(key, len(sizes) - 1)
+    made = [initialiser(k, i, o) for k, i, o in zip(keys, sizes[:-1], sizes[1:], strict=True)]
+    return MLP(tuple(weight for weight, _ in made), tuple(bias for _, bias in made))
+
+
+def apply_mlp(mlp: MLP, x: Float[Array, "*batch n"], activation: Activation) -> Float[Array, "*batch m"]:
+    """Hidden layers with the activation, the last layer linear."""
+    for weight, bias in zip(mlp.weights[:-1], mlp.biases[:-1], strict=True):
+        x = activation(x @ weight + bias)
+    return x @ mlp.weights[-1] + mlp.biases[-1]
+
+
+def descend(
+    parameters: Tree, gradient: Tree, state: optax.OptState, rate: Float[Array, ""] | float
+) -> tuple[Tree, optax.OptState]:
+    """One Adam step of that learning rate."""
+    direction, state = adam.update(gradient, state)  # pyright: ignore[reportArgumentType]
+    moved = jax.tree.map(lambda parameter, step: parameter - rate * step, parameters, direction)
+    return moved, state

@@ -1,0 +1,342 @@
+"""The command line: parse, call, print. Bad input ends with one sentence and code 2."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import difflib
+import io
+import re
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, TypeVar
+
+import tyro
+from tqdm import tqdm
+
+from senior.config import Config
+from senior.presets import preset, quick_changes
+from senior.types import BadInput
+
+DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+Options = TypeVar("Options")
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Train one run, or several in one program; each gets a directory of its own."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    seeds: int | None = None
+    """How many runs: seeds --seed, --seed + 1, ... in one program. Left out: one."""
+    out: Path | None = None
+    """Directory that takes seed-0/ and so on. Left out: runs/TASK-METHOD-PRESET."""
+
+
+@dataclass(frozen=True)
+class ResumeOptions:
+    """Continue an interrupted run, or all runs under a directory."""
+
+    run: tyro.conf.Positional[Path]
+    """A run directory, or one that holds some."""
+
+
+@dataclass(frozen=True)
+class EvalOptions:
+    """Judge a run's policy, as last saved, on fresh episodes."""
+
+    run: tyro.conf.Positional[Path]
+    """A run directory, or one that holds some."""
+    episodes: int = 10
+    """How many episodes."""
+    video: Path | None = None
+    """Write the first episode as MP4."""
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """Steps per second of the main phase, and where the time goes."""
+
+    method: str = "all"
+    """A method of `senior methods`, or all."""
+    preset: str = "paper"
+    """paper or quick."""
+    task: str = "door-lock"
+    """A task of `senior tasks`."""
+    steps: int = 300
+    """Main-phase steps to time, after the warm-up."""
+    runs: int = 1
+    """Runs in the program."""
+    device: str = "auto"
+    """auto, cpu or gpu."""
+    json: Path | None = None
+    """Write the figures there too."""
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """No options."""
+
+
+class Display:
+    """A progress bar and a graceful end on SIGINT and SIGTERM; a second signal ends the program at once."""
+
+    def __init__(self) -> None:
+        self.stop = False
+        self._bar: tqdm[Any] | None = None
+        self._began = time.monotonic()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._asked_to_stop)
+
+    def advance(self, step: int, trainees: Sequence[Any]) -> None:
+        """Draw, ten times a second at most."""
+        if self._bar is None:
+            steps = trainees[0].config.steps
+            form = "{l_bar}{bar}| {n_fmt}/{total_fmt} steps {rate_fmt}{postfix} {remaining} left"
+            self._bar = tqdm(total=steps, initial=step - 1, unit="step", bar_format=form, dynamic_ncols=True)
+        if step % 20 == 0 or step == self._bar.total:
+            told = [trainee.progress.success for trainee in trainees if trainee.progress.success is not None]
+            labels = sum(trainee.progress.labels for trainee in trainees)
+            budget = sum(trainee.config.queries.budget for trainee in trainees)
+            success = f"{sum(told) / len(told):.0%}" if told else "-"
+            asked = f"labels {labels}/{budget}, " if trainees[0].config.method.learns_reward else ""
+            self._bar.set_postfix_str(f"{asked}success {success}", refresh=False)
+            self._bar.update(step - self._bar.n)
+
+    def say(self, sentence: str) -> None:
+        """A line of its own above the bar."""
+        tqdm.write(sentence, file=sys.stderr)
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def _asked_to_stop(self, number: int, frame: FrameType | None) -> None:
+        if self.stop:
+            raise KeyboardInterrupt
+        self.stop = True
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; returns its exit code."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        if not arguments or arguments[0] in ("-h", "--help"):
+            print(_overview())
+            return DONE
+        if arguments[0] == "--version":
+            from importlib.metadata import version
+
+            print(f"senior {version('senior-rl')}")
+            return DONE
+        if arguments[0] not in COMMANDS:
+            raise BadInput.unknown("command", arguments[0], COMMANDS)
+        return COMMANDS[arguments[0]](arguments[1:])
+    except BadInput as error:
+        print(f"senior: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except BrokenPipeError:
+        return FAILED
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+def _train(arguments: list[str]) -> int:
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    for name, default in (("task", "door-lock"), ("method", "m-senior"), ("preset", "paper"), ("env", None)):
+        first.add_argument(f"--{name}", default=default)
+    try:
+        known, _ = first.parse_known_args(arguments)
+    except argparse.ArgumentError as error:
+        raise BadInput(f"{error.argument_name} needs a value.") from error
+    start = preset(known.preset, known.task, known.method)
+    text = (
+        "Train one run, or several in one program. Defaults below are those of the --task, --method and --preset "
+        "given; give these first to see yours.\n\nThe quick preset changes from the paper (for door-close):\n"
+        + quick_changes()
+    )
+    options = parse(TrainOptions, arguments, TrainOptions(config=start), "train", text)
+    from senior import program
+
+    config = options.config
+    name = (config.env or config.task).replace(":", "-").replace("/", "-")
+    out = options.out or Path("runs") / f"{name}-{config.method.name}-{config.preset}"
+    display = Display()
+    try:
+        results = program.train(config, out, options.seeds or 1, display)
+    finally:
+        display.close()
+    return _report(results, display)
+
+
+def _resume(arguments: list[str]) -> int:
+    options = parse(ResumeOptions, arguments, None, "resume")
+    from senior import program
+
+    display = Display()
+    try:
+        results = program.resume(options.run, display)
+    finally:
+        display.close()
+    return _report(results, display)
+
+
+def _report(results: Sequence[Any], display: Display) -> int:
+    """Say what came of the runs and where their files are."""
+    from senior import program
+
+    for result in results:
+        print(f"\nseed {result.seed}: {result.path}")
+        if result.failure:
+            print(f"  stopped at step {result.step}: {result.failure}")
+        elif not result.finished:
+            print(f"  interrupted at step {result.step}, all saved; go on with: senior resume {result.path}")
+        else:
+            success = "not told by the environment" if result.success_rate is None else f"{result.success_rate:.0%}"
+            print(f"  success rate   {success} in the last evaluation; labels used: {result.labels}")
+            print(f"  learning curve {result.path / 'plots' / 'learning-curve.png'}")
+            video = result.path / "videos" / "final.mp4"
+            reason = program.film_policy(result.path, video)
+            print(f"  video          {reason or video}")
+    if any(result.failure for result in results):
+        return FAILED
+    return INTERRUPTED if display.stop and not all(result.finished for result in results) else DONE
+
+
+def _eval(arguments: list[str]) -> int:
+    options = parse(EvalOptions, arguments, None, "eval")
+    from senior import program
+
+    found = program.find_runs(options.run)
+    if options.video and len(found) > 1:
+        raise BadInput(f"--video films one run, and there are {len(found)} under {options.run}; name one of them.")
+    for path in found:
+        judged = program.evaluate_run(path, options.episodes, options.video)
+        success = "not told" if judged.success_rate is None else f"{judged.success_rate:.3f}"
+        print(
+            f"{path}: policy of step {judged.step}, {judged.episodes} fresh episodes: success rate {success}, "
+            f"true return {judged.return_mean:.1f} +- {judged.return_std:.1f}"
+        )
+        if options.video:
+            print(judged.no_video or f"video: {judged.video}")
+    return DONE
+
+
+def _tasks(arguments: list[str]) -> int:
+    parse(NoOptions, arguments, None, "tasks")
+    from senior import envs
+
+    print(table(("task", "what is to be done", "goal"), envs.tasks_table()))
+    return DONE
+
+
+def _methods(arguments: list[str]) -> int:
+    parse(NoOptions, arguments, None, "methods")
+    from senior.methods import METHODS
+
+    rows = [
+        [cell if cell != "none" else "-" for cell in (row.name, row.select, row.explore, row.mix, row.outer)]
+        + [f"{preset('paper', 'door-lock', row.name).reward.members} members" if row.learns_reward else "true reward"]
+        for row in METHODS.values()
+    ]
+    print(table(("method", "select", "explore", "replay mix", "outer step", "reward fit"), rows))
+    return DONE
+
+
+def _bench(arguments: list[str]) -> int:
+    options = parse(BenchOptions, arguments, None, "bench")
+    from senior import bench
+
+    bench.run(options.method, options.preset, options.task, options.steps, options.runs, options.device, options.json)
+    return DONE
+
+
+COMMANDS: dict[str, Callable[[list[str]], int]] = {
+    "train": _train,
+    "resume": _resume,
+    "eval": _eval,
+    "tasks": _tasks,
+    "methods": _methods,
+    "bench": _bench,
+}
+_SUMMARIES = {
+    "train": "train one run, or several seeds in one program",
+    "resume": "continue an interrupted run, or all runs under a directory",
+    "eval": "judge a run's policy on fresh episodes, and film it",
+    "tasks": "list the tasks",
+    "methods": "list the methods, cell by cell",
+    "bench": "measure steps per second and where the time goes",
+}
+
+
+def _overview() -> str:
+    lines = ["usage: senior COMMAND [OPTIONS]", "", "Teach robots by preference.", ""]
+    lines += [f"  {name:8} {summary}" for name, summary in _SUMMARIES.items()]
+    return "\n".join([*lines, "", "senior COMMAND --help tells a command's options."])
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Plain columns."""
+    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in [head, *rows]]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def parse(
+    kind: type[Options], arguments: list[str], default: Options | None, command: str, text: str | None = None
+) -> Options:
+    """Options of a command by tyro, with its complaints made one sentence."""
+    complaint = io.StringIO()
+    extra = {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stderr(complaint):
+            options, unknown = tyro.cli(
+                kind,
+                prog=f"senior {command}",
+                description=text,
+                args=arguments,
+                return_unknown_args=True,
+                config=(tyro.conf.FlagConversionOff, tyro.conf.AvoidSubcommands),
+                **extra,
+            )
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise BadInput(_one_sentence(complaint.getvalue())) from None
+    if unknown:
+        raise BadInput(_unknown_option(kind, unknown[0], default, command))
+    return options
+
+
+def _unknown_option(kind: type[Any], option: str, default: Any, command: str) -> str:
+    if not option.startswith("-"):
+        return f"senior {command} has no use for {option!r}; see senior {command} --help."
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
+        tyro.cli(kind, args=["--help"], **({} if default is None else {"default": default}))
+    options = sorted(set(re.findall(r"--[a-z][a-z0-9.-]*", shown.getvalue())))
+    near = difflib.get_close_matches(option.split("=")[0].replace("_", "-"), options, n=1, cutoff=0.4)
+    return f"Unknown option {option}; did you mean {near[0]}?" if near else f"Unknown option {option}."
+
+
+def _one_sentence(box: str) -> str:
+    """The text inside tyro's box, without its frame, hints and line breaks."""
+    lines = [re.sub(r"[│╭╮╰╯─┌┐└┘]|\x1b\[[0-9;]*m", " ", line).strip() for line in box.splitlines()]
+    kept: list[str] = []
+    for line in lines:
+        if line.lower().startswith(("for full helptext", "parsing error")) or not line:
+            continue
+        kept.append(line)
+    sentence = " ".join(" ".join(kept).split())
+    return sentence if sentence.endswith((".", "!", "?")) else sentence + "."
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,355 @@
+"""The whole configuration of one run: frozen dataclasses, the same in Python, in JSON and on the command line.
+
+Every number that a paper leaves open is a named field here, with the reading we recommend as its default
+(docs/methods.md gives the reasons). ``presets.py`` fills in what depends on task and method.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cattrs
+import tyro
+
+from senior.methods import Method
+from senior.types import BadInput
+
+_FLAT = tyro.conf.arg(name="")
+"""A group whose fields are options without the group's name in front."""
+
+
+def _flag(name: str) -> Any:
+    """A field of a nested group whose command-line name stands alone: ``--bandwidth-mds``."""
+    return tyro.conf.arg(name=name, prefix_name=False)
+
+
+@dataclass(frozen=True)
+class Networks:
+    """Sizes of actor, critics and reward model."""
+
+    layers: int = 3
+    """Hidden layers of the actor and of each critic."""
+    width: int = 256
+    """Units of each hidden layer of the actor and of each critic."""
+    reward_layers: int = 3
+    """Hidden layers of each member of the reward ensemble."""
+    reward_width: int = 256
+    """Units of each hidden layer of the reward ensemble."""
+
+
+@dataclass(frozen=True)
+class SAC:
+    """Soft actor-critic, as PEBBLE runs it on Meta-World (docs/methods.md)."""
+
+    batch: int = 512
+    """Transitions of one update."""
+    actor_rate: float = 3e-4
+    """Adam's learning rate for the actor."""
+    critic_rate: float = 3e-4
+    """Adam's learning rate for the critics."""
+    alpha_rate: float = 1e-4
+    """Adam's learning rate for the temperature."""
+    rate_end: float = 1.0
+    """Factor on the actor's and critics' learning rates at the last step, reached along a straight line from pre-training's end. 1: constant, as in the papers."""
+    discount: float = 0.99
+    """Discount gamma."""
+    tau: float = 0.005
+    """Polyak step of the target critics."""
+    target_every: int = 2
+    """Steps between moves of the target critics."""
+    initial_alpha: float = 0.1
+    """Temperature at the start."""
+    updates: int = 1
+    """Updates per environment step in the main phase."""
+    reset_updates: int = 100
+    """Updates right after the critics are renewed at the end of pre-training."""
+    evaluate_average: float = 0.0
+    """Decay of the running average of the actor's weights that is evaluated and delivered. 0: the actor itself, as in the papers."""
+
+
+@dataclass(frozen=True)
+class Pretraining:
+    """Random steps, then exploration by state entropy (PEBBLE)."""
+
+    random_steps: int = 1000
+    """Uniformly random actions before the first update."""
+    until: int = 10_000
+    """Step at which pre-training ends and the first session takes place. 0: no pre-training (plain SAC)."""
+    neighbours: int = 5
+    """The k of the k-nearest-neighbour state entropy."""
+
+
+@dataclass(frozen=True)
+class Reward:
+    """Reward ensemble and its Bradley-Terry fit (Eq. 1 and 2)."""
+
+    members: int = 3
+    """Members of the ensemble."""
+    rate: float = 3e-4
+    """Adam's learning rate, shared with the outer step unless told otherwise."""
+    epochs: int = 10
+    """Most passes over the labels per session."""
+    batch: int = 128
+    """Pairs of one gradient step."""
+    stop_accuracy: float = 0.97
+    """A session's fit ends after an epoch with more training accuracy than this."""
+
+
+@dataclass(frozen=True)
+class Queries:
+    """Which segments can be asked about, and when."""
+
+    budget: int = 250
+    """Pairs asked in the whole run; a skipped pair counts too."""
+    per_session: int = 5
+    """Pairs asked per session (M)."""
+    every: Annotated[int, _flag("session-every")] = 5000
+    """Steps between sessions (K)."""
+    segment: int = 50
+    """Steps of a segment (H)."""
+    episodes: Annotated[int, _flag("candidate-episodes")] = 100
+    """How many of the latest complete episodes segments are cut from."""
+    pool: int = 10
+    """Candidate pairs per asked pair: the pool p has this times M pairs."""
+
+
+@dataclass(frozen=True)
+class MotionDistinction:
+    """MDS, Eq. 3 to 5, and the points that the paper leaves open."""
+
+    keep: float = 0.3
+    """Share of the pool that the motion score keeps (q / p)."""
+    bandwidth: Annotated[float, _flag("bandwidth-mds")] = 0.05
+    """Bandwidth h of the densities of MDS, in length scales (metres in Meta-World)."""
+    density_sum: Annotated[Literal["density", "log"], _flag("density-sum")] = "density"
+    """What the motion score sums: the density (paper) or its logarithm (public code)."""
+    axis: Annotated[Literal["oriented", "raw", "absolute"], _flag("axis")] = "oriented"
+    """Sign of a segment's principal axis: along its displacement, as the solver returns it, or ignored."""
+
+
+@dataclass(frozen=True)
+class PreferenceGuided:
+    """PGE, Eq. 6 to 8, and the points that the paper leaves open."""
+
+    capacity: int = 1000
+    """Rows of the curiosity buffer and of the preference sample."""
+    share: float = 0.3
+    """Share of a batch that is drawn from the curiosity buffer."""
+    every: Annotated[int, _flag("refresh-every")] = 1000
+    """Steps between refreshes of the curiosity buffer (Q)."""
+    bandwidth: Annotated[float, _flag("bandwidth-pge")] = 0.1
+    """Bandwidth h of the densities of PGE, in length scales (metres in Meta-World)."""
+    beta: float = 0.1
+    """Weight of the bonus at its first use (beta_0)."""
+    decay: float = 0.01
+    """Decay rate of the weight (rho)."""
+    clock: Annotated[Literal["refresh", "env_step", "since_pretrain"], _flag("beta-clock")] = "refresh"
+    """What t counts in beta_t: refreshes, environment steps, or steps since pre-training."""
+
+
+@dataclass(frozen=True)
+class Bilevel:
+    """Meta-Reward-Net's outer step."""
+
+    every: Annotated[int, _flag("outer-every")] = 10_000
+    """Steps between outer steps (N)."""
+    weight: float = 0.1
+    """Factor on the outer loss."""
+    optimizer: Annotated[Literal["shared", "separate"], _flag("outer-optimizer")] = "shared"
+    """Adam of the outer step: the reward fit's own (public code) or another."""
+    after_budget: bool = False
+    """Go on with outer steps when the budget is spent (the paper's Algorithm 1 read literally)."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How often the policy is judged, on episodes of its own."""
+
+    every: int = 10_000
+    """Steps between evaluations."""
+    episodes: int = 10
+    """Episodes of one evaluation, with the mean action."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """One run. `senior.presets.preset` makes one; `check` refuses what makes no sense."""
+
+    task: str = "door-lock"
+    """A task of `senior tasks`; ignored where --env is given."""
+    method: Annotated[Method, _FLAT] = field(default_factory=Method)
+    preset: Literal["paper", "quick"] = "paper"
+    """paper: the numbers of the paper. quick: see below."""
+    seed: int = 0
+    """Seed of everything random in the run."""
+    steps: int = 1_000_000
+    """Environment steps."""
+    teacher: str = "oracle"
+    """Who answers: oracle (compares true returns), or module:Name."""
+    env: str | None = None
+    """Any Gymnasium environment with Box spaces instead of a task: module:Name or a registered id."""
+    position: str | None = None
+    """Where the end-effector position lies in the observation of --env, for instance 0:3."""
+    length_scale: float | None = None
+    """The unit of both bandwidths in --env. Left out: ten times the spread of the positions seen in pre-training."""
+    horizon: int | None = None
+    """Most steps of an episode of --env, where it does not tell."""
+    queries: Annotated[Queries, _FLAT] = field(default_factory=Queries)
+    pretraining: Pretraining = field(default_factory=Pretraining)
+    networks: Networks = field(default_factory=Networks)
+    sac: SAC = field(default_factory=SAC)
+    reward: Reward = field(default_factory=Reward)
+    mds: MotionDistinction = field(default_factory=MotionDistinction)
+    pge: PreferenceGuided = field(default_factory=PreferenceGuided)
+    bilevel: Bilevel = field(default_factory=Bilevel)
+    evaluation: Evaluation = field(default_factory=Evaluation)
+    replay_capacity: int | None = None
+    """Transitions kept; left out: all steps of the run."""
+    checkpoint_every: int = 10_000
+    """Steps between checkpoints."""
+    snapshot_every: int = 50_000
+    """Steps between snapshots of visited positions and of the bonus's densities."""
+    device: Literal["auto", "cpu", "gpu"] = "auto"
+    """Where to compute. gpu: an error if there is none."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Number format of the networks. bfloat16 is not offered yet."""
+
+    @property
+    def capacity(self) -> int:
+        """Rows of the replay buffer."""
+        return self.replay_capacity or self.steps
+
+
+def to_json(config: Config) -> dict[str, Any]:
+    """The configuration as plain JSON data; `from_json` is its inverse."""
+    return asdict(config)
+
+
+def from_json(data: dict[str, Any]) -> Config:
+    """Read a configuration. An unknown key, a missing one's wrong type: `BadInput`."""
+    converter = cattrs.Converter(forbid_extra_keys=True)
+    try:
+        return converter.structure(data, Config)
+    except (cattrs.BaseValidationError, TypeError, ValueError) as error:
+        reasons = "; ".join(cattrs.transform_error(error))
+        raise BadInput(f"The configuration cannot be read: {reasons}.") from error
+
+
+def load(path: Path) -> Config:
+    """The configuration in a run directory's ``config.json``."""
+    try:
+        return from_json(json.loads(path.read_text())["config"])
+    except FileNotFoundError:
+        raise BadInput(f"{path.parent} is not a run directory: it holds no config.json.") from None
+    except (json.JSONDecodeError, KeyError) as error:
+        raise BadInput(f"{path} is damaged: {error}.") from error
+
+
+def differences(one: Any, other: Any, prefix: str = "") -> list[tuple[str, Any, Any]]:
+    """Fields in which two configurations differ, as (dotted name, value in one, value in other)."""
+    found: list[tuple[str, Any, Any]] = []
+    for entry in fields(one):
+        left, right = getattr(one, entry.name), getattr(other, entry.name)
+        if is_dataclass(left):
+            found += differences(left, right, f"{prefix}{entry.name}.")
+        elif left != right:
+            found.append((prefix + entry.name, left, right))
+    return found
+
+
+def _require(condition: bool, sentence: str) -> None:
+    if not condition:
+        raise BadInput(sentence)
+
+
+def check(config: Config) -> Config:
+    """Refuse a configuration that makes no sense, with one sentence that says why."""
+    queries, row = config.queries, config.method
+    for name, value in (
+        ("--steps", config.steps),
+        ("--per-session", queries.per_session),
+        ("--session-every", queries.every),
+        ("--refresh-every", config.pge.every),
+        ("--outer-every", config.bilevel.every),
+        ("--segment", queries.segment),
+        ("--candidate-episodes", queries.episodes),
+        ("--pool", queries.pool),
+        ("--sac.batch", config.sac.batch),
+        ("--sac.updates", config.sac.updates),
+        ("--sac.target-every", config.sac.target_every),
+        ("--reward.members", config.reward.members),
+        ("--reward.batch", config.reward.batch),
+        ("--reward.epochs", config.reward.epochs),
+        ("--networks.layers", config.networks.layers),
+        ("--networks.width", config.networks.width),
+        ("--networks.reward-layers", config.networks.reward_layers),
+        ("--networks.reward-width", config.networks.reward_width),
+        ("--evaluation.every", config.evaluation.every),
+        ("--evaluation.episodes", config.evaluation.episodes),
+        ("--checkpoint-every", config.checkpoint_every),
+        ("--snapshot-every", config.snapshot_every),
+        ("--pretraining.neighbours", config.pretraining.neighbours),
+        ("--pge.capacity", config.pge.capacity),
+        ("--replay-capacity", config.capacity),
+    ):
+        _require(value >= 1, f"{name} must be at least 1, not {value}.")
+    for name, number in (
+        ("--bandwidth-mds", config.mds.bandwidth),
+        ("--bandwidth-pge", config.pge.bandwidth),
+        ("--sac.actor-rate", config.sac.actor_rate),
+        ("--sac.critic-rate", config.sac.critic_rate),
+        ("--sac.alpha-rate", config.sac.alpha_rate),
+        ("--sac.initial-alpha", config.sac.initial_alpha),
+        ("--reward.rate", config.reward.rate),
+        ("--length-scale", 1.0 if config.length_scale is None else config.length_scale),
+    ):
+        _require(0 < number < float("inf"), f"{name} must be a positive number, not {number}.")
+    for name, share in (
+        ("--pge.share", config.pge.share),
+        ("--mds.keep", config.mds.keep),
+        ("--pge.decay", config.pge.decay),
+        ("--sac.tau", config.sac.tau),
+        ("--sac.discount", config.sac.discount),
+        ("--sac.rate-end", config.sac.rate_end),
+        ("--sac.evaluate-average", config.sac.evaluate_average),
+    ):
+        _require(0 <= share <= 1, f"{name} must lie between 0 and 1, not {share}.")
+    _require(config.seed >= 0, f"--seed must be 0 or more, not {config.seed}.")
+    _require(
+        config.precision == "float32",
+        "--precision bfloat16 is not offered yet: its learning curves have not been compared with float32's.",
+    )
+    row.check()
+    until, random_steps = config.pretraining.until, config.pretraining.random_steps
+    if not row.learns_reward:
+        _require(until == 0, f"Method {row.name} learns from the true reward, so --pretraining.until must be 0.")
+        return config
+    _require(
+        queries.budget >= queries.per_session,
+        f"The budget of {queries.budget} labels is below one session of {queries.per_session}; "
+        "raise --budget or lower --per-session.",
+    )
+    _require(
+        config.steps > until,
+        f"{config.steps} steps end before the first session at step {until}; raise --steps or lower --pretraining.until.",
+    )
+    _require(
+        random_steps + config.pretraining.neighbours < until,
+        f"Pre-training must last beyond its {random_steps} random steps; raise --pretraining.until ({until}).",
+    )
+    _require(
+        config.capacity > until,
+        f"A replay of {config.capacity} rows cannot hold pre-training's {until} steps; raise --replay-capacity.",
+    )
+    if row.explore == "preference_guided":
+        every = config.pge.every
+        for name, other in (("K, --session-every", queries.every), ("N, --outer-every", config.bilevel.every)):
+            if name.startswith("K") or row.outer == "bilevel":
+                _require(
+                    other % every == 0,
+                    f"Q, --refresh-every {every}, must divide {name} {other} (the paper's Algorithm 1).",
+                )
+    return config

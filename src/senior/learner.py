@@ -1,0 +1,311 @@
+"""The traced half of a run: its state, and the pure functions of one run that the loop calls.
+
+Every function takes the state of one run first and returns ``(state, result)``; there is no run axis in sight
+(`senior.runs` lifts them). Host things (the environment, the schedule, teachers, files) are in `senior.loop`.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from senior import replay as replay_
+from senior.agent import sac
+from senior.config import Config
+from senior.explore import Bonus, Now, state_entropy
+from senior.replay import Fact, Replay
+from senior.reward import bilevel, model
+from senior.types import Batch, EnvSpec
+
+
+class Purpose(IntEnum):
+    """What a random number is for: keys are ``fold_in(seed, purpose, step)``."""
+
+    INIT = 0
+    ACT = 1
+    UPDATE = 2
+    RENEW = 3
+    FIT = 4
+    SESSION = 5
+    REFRESH = 6
+    OUTER = 7
+    CANDIDATES = 8  # these and the next are drawn on the host
+    SELECT = 9
+    SIDES = 10
+    SNAPSHOT = 11
+
+
+class Numbers(NamedTuple):
+    """Numeric hyper-parameters of one run, traced: runs that differ in them share one program."""
+
+    sac: sac.Numbers
+    fit: model.FitNumbers
+    outer: bilevel.OuterNumbers
+    until: Int[Array, ""]
+    steps: Int[Array, ""]
+    rate_end: Float[Array, ""]
+
+
+class Run(NamedTuple):
+    """Everything of one run that changes while it learns and lives on the device."""
+
+    seed: Int[Array, ""]
+    numbers: Numbers
+    agent: sac.Agent
+    model: model.RewardModel | None  # None for plain SAC
+    replay: Replay
+    entropy: state_entropy.StateEntropy | None  # None without pre-training
+    bonus: Any
+    length_scale: Float[Array, ""]
+    learned_return: Float[Array, ""]  # learned reward summed over the running episode
+
+
+def _numbers(config: Config) -> Numbers:
+    values = Numbers(
+        sac.Numbers(
+            config.sac.actor_rate,
+            config.sac.critic_rate,
+            config.sac.alpha_rate,
+            config.sac.discount,
+            config.sac.tau,
+            config.sac.evaluate_average,
+        ),
+        model.FitNumbers(config.reward.rate, config.reward.epochs, config.reward.stop_accuracy),
+        bilevel.OuterNumbers(
+            config.sac.critic_rate, config.reward.rate, config.bilevel.weight, config.sac.discount
+        ),
+        until=jnp.int32(config.pretraining.until),
+        steps=jnp.int32(config.steps),
+        rate_end=jnp.float32(config.sac.rate_end),
+    )
+    return jax.tree.map(jnp.asarray, values)
+
+
+class Learner:
+    """The functions of one run for one configuration of shapes and method cells. Holds no state."""
+
+    def __init__(self, config: Config, spec: EnvSpec, bonus: Bonus) -> None:
+        self.config = config
+        self.spec = spec
+        self.bonus = bonus
+
+    def init(self, seed: int) -> Run:
+        """The state before the first step."""
+        return jax.jit(self._init)(np.uint32(seed))
+
+    def _init(self, seed: Int[Array, ""]) -> Run:
+        config, spec, nets = self.config, self.spec, self.config.networks
+        key_agent, key_model = jax.random.split(
+            jax.random.fold_in(jax.random.key(seed), Purpose.INIT)
+        )
+        learns = config.method.learns_reward
+        size_in = spec.observation_size + spec.action_size
+        return Run(
+            seed=seed,
+            numbers=_numbers(config),
+            agent=sac.init(
+                key_agent,
+                spec.observation_size,
+                spec.action_size,
+                nets.layers,
+                nets.width,
+                config.sac.initial_alpha,
+            ),
+            model=model.init(
+                key_model, config.reward.members, size_in, nets.reward_layers, nets.reward_width
+            )
+            if learns
+            else None,
+            replay=replay_.init(config.capacity, spec.observation_size, spec.action_size),
+            entropy=state_entropy.init(
+                config.pretraining.until, spec.observation_size, config.pretraining.neighbours
+            )
+            if config.pretraining.until
+            else None,
+            bonus=self.bonus.init(),
+            length_scale=jnp.float32(spec.length_scale or 1.0),
+            learned_return=jnp.zeros(()),
+        )
+
+    # Every step.
+
+    def act(
+        self, run: Run, observation: Float[Array, " o"], step: Int[Array, ""], random: Bool[Array, ""]
+    ) -> tuple[Run, Float[Array, " a"]]:
+        """An action of the policy, or a uniform one."""
+        key_policy, key_uniform = jax.random.split(_key(run, Purpose.ACT, step))
+        action, _ = sac.sample(run.agent.actor, observation, key_policy)
+        uniform = jax.random.uniform(key_uniform, action.shape, minval=-1, maxval=1)
+        return run, jnp.where(random, uniform, action)
+
+    def store(self, run: Run, fact: Fact) -> tuple[Run, Float[Array, ""]]:
+        """Store what happened, with its learned reward; returns the episode's learned return so far."""
+        mean, spread = self._score(run, fact.observation[None], fact.action[None])
+        learned_return = run.learned_return + mean[0]
+        over = fact.terminated | fact.truncated
+        run = run._replace(
+            replay=replay_.store(run.replay, fact, mean[0], spread[0]),
+            learned_return=jnp.where(over, 0.0, learned_return),
+        )
+        return run, learned_return
+
+    def store_pretraining(self, run: Run, fact: Fact) -> tuple[Run, Float[Array, ""]]:
+        """`store`, and the state enters the nearest-neighbour table."""
+        run = run._replace(entropy=state_entropy.insert(_some(run.entropy), fact.observation))
+        return self.store(run, fact)
+
+    def pretrain(self, run: Run, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
+        """One update whose reward is the state entropy."""
+        key_batch, key_update = jax.random.split(_key(run, Purpose.UPDATE, step))
+        batch = replay_.sample(run.replay, key_batch, self.config.sac.batch)
+        entropy, reward = state_entropy.reward(_some(run.entropy), batch.row)
+        move = step % self.config.sac.target_every == 0
+        agent, info = sac.update(run.agent, batch, reward, key_update, run.numbers.sac, move)
+        return run._replace(agent=agent, entropy=entropy), info
+
+    def learn(self, run: Run, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
+        """The ordinary updates of a step."""
+        return self._updates(run, step, Purpose.UPDATE, self.config.sac.updates)
+
+    # Now and then.
+
+    def begin(self, run: Run, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
+        """The end of pre-training: new critics, then the first updates on the learned reward."""
+        agent = sac.renew_critics(run.agent, _key(run, Purpose.RENEW, step))
+        run = run._replace(agent=agent)
+        return self._updates(run, step, Purpose.RENEW, self.config.sac.reset_updates)
+
+    def cut(self, run: Run, starts: Int[Array, "p 2"]) -> tuple[Run, tuple[Array, Array, Array]]:
+        """Observations, actions and true rewards of segments that begin at those rows of the run."""
+        return run, replay_.segments(run.replay, starts, self.config.queries.segment)
+
+    def summed_rewards(
+        self, run: Run, observation: Float[Array, "p 2 H o"], action: Float[Array, "p 2 H a"]
+    ) -> tuple[Run, Float[Array, "members p 2"]]:
+        """Every member's sum of rewards of each segment: the logits of Eq. 1."""
+        return run, model.rewards(_some(run.model).members, observation, action).sum(axis=-1)
+
+    def fit(
+        self, run: Run, labelled: model.Labelled, step: Int[Array, ""]
+    ) -> tuple[Run, dict[str, Array]]:
+        """Fit the reward model to all labels and relabel the replay."""
+        key = _key(run, Purpose.FIT, step)
+        fitted, info = model.fit(_some(run.model), labelled, key, self.config.reward.batch, run.numbers.fit)
+        return self._relabel(run._replace(model=fitted)), info
+
+    def on_session(
+        self, run: Run, preferred: Float[Array, "n d"], count: Int[Array, ""], step: Int[Array, ""]
+    ) -> tuple[Run, None]:
+        """Tell the bonus which positions are preferred."""
+        key = _key(run, Purpose.SESSION, step)
+        return run._replace(bonus=self.bonus.on_session(run.bonus, key, preferred, count)), None
+
+    def refresh(self, run: Run, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
+        """Bring the bonus up to date."""
+        key = _key(run, Purpose.REFRESH, step)
+        bonus = self.bonus.on_refresh(run.bonus, key, run.replay, self._now(run, step))
+        return run._replace(bonus=bonus), self.bonus.report(bonus)
+
+    def outer(
+        self, run: Run, pairs: bilevel.FirstSteps, step: Int[Array, ""]
+    ) -> tuple[Run, dict[str, Array]]:
+        """Meta-Reward-Net's outer step on a uniform batch; relabels the replay."""
+        key_batch, key_value = jax.random.split(_key(run, Purpose.OUTER, step))
+        batch = replay_.sample(run.replay, key_batch, self.config.sac.batch)
+        separate = self.config.bilevel.optimizer == "separate"
+        fitted, info = bilevel.outer_step(
+            _some(run.model), run.agent, batch, pairs, key_value, run.numbers.outer, separate
+        )
+        return self._relabel(run._replace(model=fitted)), info
+
+    def measure(self, run: Run) -> tuple[Run, Float[Array, ""]]:
+        """Take the length scale from the data: ten times the spread of the positions stored so far.
+
+        In Meta-World the unit is a metre, ten times the spread of the hand's places; so a bandwidth means the
+        same share of the visited space everywhere.
+        """
+        filled = jnp.arange(run.replay.capacity) < run.replay.filled
+        position = run.replay.facts.observation[:, self.spec.position]
+        total = jnp.maximum(filled.sum(), 1)
+        mean = jnp.sum(position * filled[:, None], axis=0) / total
+        variance = jnp.sum(((position - mean) ** 2) * filled[:, None], axis=0) / total
+        scale = jnp.maximum(10 * jnp.sqrt(variance.mean()), 1e-6)
+        return run._replace(length_scale=scale), scale
+
+    # Shared by the above.
+
+    def _now(self, run: Run, step: Array) -> Now:
+        return Now(step, step - run.numbers.until, run.length_scale)
+
+    def _draw(self, run: Run, key: PRNGKeyArray) -> Batch:
+        size = self.config.sac.batch
+        key_replay, key_other = jax.random.split(key)
+        batch = replay_.sample(run.replay, key_replay, size)
+        if self.config.method.mix == "uniform":
+            return batch
+        rows = jax.random.randint(key_other, (int(self.config.pge.share * size),), 0, self.config.pge.capacity)
+        curious = jax.tree.map(lambda column: column[rows], run.bonus.curiosity)
+        return replay_.mix(batch, curious, run.bonus.ready)
+
+    def _updates(
+        self, run: Run, step: Array, purpose: Purpose, times: int
+    ) -> tuple[Run, dict[str, Array]]:
+        key, now = _key(run, purpose, step), self._now(run, step)
+        along = jnp.clip((step - run.numbers.until) / (run.numbers.steps - run.numbers.until), 0, 1)
+        rate = 1 + (run.numbers.rate_end - 1) * along
+        numbers = run.numbers.sac._replace(
+            actor_rate=run.numbers.sac.actor_rate * rate, critic_rate=run.numbers.sac.critic_rate * rate
+        )
+
+        def one(agent: sac.Agent, i: Array | int) -> tuple[sac.Agent, dict[str, Array]]:
+            key_batch, key_update = jax.random.split(jax.random.fold_in(key, i))
+            batch = self._draw(run, key_batch)
+            paid = self.bonus.value(run.bonus, batch, now)
+            reward = batch.learned_reward + paid if self.config.method.learns_reward else batch.reward
+            nth = i if purpose is Purpose.RENEW else step * times + i
+            move = nth % self.config.sac.target_every == 0
+            agent, info = sac.update(agent, batch, reward, key_update, numbers, move)
+            return agent, {**info, "bonus_mean": paid.mean(), "batch_reward": reward.mean()}
+
+        if times == 1:
+            agent, info = one(run.agent, 0)
+        else:
+            agent, infos = jax.lax.scan(one, run.agent, jnp.arange(times))
+            info = jax.tree.map(lambda values: values[-1], infos)
+        return run._replace(agent=agent), info
+
+    def _score(self, run: Run, observation: Array, action: Array) -> tuple[Array, Array]:
+        if run.model is None:
+            nothing = jnp.zeros(observation.shape[:-1])
+            return nothing, nothing
+        all_members = model.rewards(run.model.members, observation, action)
+        return all_members.mean(axis=0), all_members.std(axis=0)
+
+    def _relabel(self, run: Run) -> Run:
+        run = run._replace(replay=replay_.relabel(run.replay, lambda o, a: self._score(run, o, a)))
+        if self.config.method.mix != "curiosity":
+            return run
+        held = run.bonus.curiosity
+        mean, spread = self._score(run, held.observation, held.action)
+        return run._replace(
+            bonus=run.bonus._replace(curiosity=held._replace(learned_reward=mean, spread=spread))
+        )
+
+
+def mean_action(actor: Any, observation: Float[Array, " o"]) -> Float[Array, " a"]:
+    """The action that evaluation takes; ``actor`` is ``run.agent.average``."""
+    return sac.mean_action(actor, observation)
+
+
+def _key(run: Run, purpose: Purpose, step: Array | int) -> PRNGKeyArray:
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(run.seed), purpose), step)
+
+
+def _some(part: Any) -> Any:
+    assert part is not None, "this run has no such part"
+    return part

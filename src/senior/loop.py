@@ -1,0 +1,353 @@
+"""Algorithm 1 of the paper as one ordinary loop. Host code only: what is computed is in `senior.learner`.
+
+A step of every run: choose an action; take it; if a session is due, select, ask, fit and relabel; if due, the
+outer step; if due, refresh the bonus; update; store. Taking the action commutes with all that follows, and is done
+first so that an environment that breaks leaves a whole step undone, to be resumed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+
+from senior import health, parts
+from senior.envs.vector import Failure, Step
+from senior.evaluate import EpisodeFailed, judge, summary
+from senior.learner import Purpose, mean_action
+from senior.replay import Fact
+from senior.runs import Runs
+from senior.schedule import Due, due
+from senior.select import Context, probability_second
+from senior.trainee import Trainee
+from senior.types import Pairs, Preferred, Query
+
+
+class Watcher(Protocol):
+    """Who looks on while training runs."""
+
+    def advance(self, step: int, trainees: Sequence[Trainee]) -> None:
+        """A step was done."""
+        ...
+
+    def say(self, sentence: str) -> None:
+        """Something a person should read."""
+        ...
+
+    @property
+    def stop(self) -> bool:
+        """Whether to save everything and leave, as after an interrupt."""
+        ...
+
+
+class Clock:
+    """Seconds per part of the loop since the last row of timing.csv."""
+
+    def __init__(self, start: int) -> None:
+        self.spent: dict[str, float] = defaultdict(float)
+        self.started = self.last = time.perf_counter()
+        self.last_step = start
+        self.latest: dict[str, float] = {}
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.spent[name] += time.perf_counter() - began
+
+    def row(self, step: int) -> dict[str, float]:
+        """The parts since the last row, and the rate at which all runs together advanced; the same for every run."""
+        if step == self.last_step:
+            return self.latest
+        now = time.perf_counter()
+        rate = (step - self.last_step) / (now - self.last)
+        row = {"step": step, "seconds": now - self.started, "steps_per_second": rate, **self.spent}
+        self.spent.clear()
+        self.last, self.last_step, self.latest = now, step, row
+        return row
+
+
+class Training:
+    """R runs that advance together."""
+
+    def __init__(self, trainees: Sequence[Trainee], runs: Runs, watcher: Watcher) -> None:
+        self.trainees = list(trainees)
+        self.runs = runs
+        self.watcher = watcher
+        self.clock = Clock(trainees[0].progress.step)
+        self.policy = jax.jit(mean_action)
+
+    def train(self) -> None:
+        """Run from where the runs stand to their end, or until the watcher says stop."""
+        last, learner = self.trainees[0].config.steps, self.trainees[0].learner
+        start = self.trainees[0].progress.step
+        for step in range(start, last + 1):
+            stop = self.watcher.stop
+            for i in self.active():
+                self.look_back(i, step, stop or step == last)
+            if stop or step == last or not self.active():
+                return
+
+            plans = [due(trainee.config, step, trainee.progress.queried) for trainee in self.trainees]
+            with self.clock.part("act"):
+                actions = self.runs.every(
+                    learner.act,
+                    self.mask(),
+                    [trainee.environment.observations[0] for trainee in self.trainees],
+                    [np.int32(step)] * len(plans),
+                    [np.bool_(plan.random) for plan in plans],
+                )
+                actions = [np.asarray(actions[i]) if on else None for i, on in enumerate(self.mask())]
+            with self.clock.part("environment"):
+                happened = self.take(actions, step)
+
+            with self.clock.part("session"):
+                for i in self.active():
+                    self.now_and_then(i, step, plans[i])
+            with self.clock.part("update"):
+                info = self.update(step, plans)
+            with self.clock.part("store"):
+                self.store(step, plans, happened, info)
+            self.watcher.advance(step + 1, self.trainees)
+
+    def active(self) -> list[int]:
+        """Runs that have not failed."""
+        return [i for i, trainee in enumerate(self.trainees) if trainee.failure is None]
+
+    def mask(self) -> list[bool]:
+        return [trainee.failure is None for trainee in self.trainees]
+
+    # Every step.
+
+    def take(self, actions: Sequence[np.ndarray | None], step: int) -> list[Step | None]:
+        """Step the environments; a run whose environment breaks is saved as it was, and stopped."""
+        happened: list[Step | None] = []
+        for i, (trainee, action) in enumerate(zip(self.trainees, actions, strict=True)):
+            result = None if action is None else trainee.environment.step(0, action)
+            if isinstance(result, Failure):
+                self.fail(i, step, result.message)
+                result = None
+            happened.append(result)
+        return happened
+
+    def update(self, step: int, plans: Sequence[Due]) -> Any:
+        """The update of every run: state entropy in pre-training, the learned reward afterwards."""
+        learner, steps = self.trainees[0].learner, [np.int32(step)] * len(plans)
+        info = None
+        pretrain = [plan.pretrain and on for plan, on in zip(plans, self.mask(), strict=True)]
+        if any(pretrain):
+            info = self.runs.every(learner.pretrain, pretrain, steps)
+        ordinary = [plan.update and on for plan, on in zip(plans, self.mask(), strict=True)]
+        if any(ordinary):
+            info = self.runs.every(learner.learn, ordinary, steps)
+        for trainee, first, second in zip(self.trainees, pretrain, ordinary, strict=True):
+            trainee.progress.pretraining_updates += first
+            trainee.progress.updates += second * trainee.config.sac.updates
+        return info
+
+    def store(self, step: int, plans: Sequence[Due], happened: Sequence[Step | None], info: Any) -> None:
+        """Store what happened in every run, and count it."""
+        learner = self.trainees[0].learner
+        facts = [_fact(trainee, one) for trainee, one in zip(self.trainees, happened, strict=True)]
+        until = self.trainees[0].config.pretraining.until
+        function = learner.store_pretraining if step < until else learner.store
+        returns = self.runs.every(function, self.mask(), facts)
+        for i, one in enumerate(happened):
+            if one is not None:
+                self.trainees[i].record(
+                    step, one, returns[i] if one.ended else None, info[i] if one.ended and info else None
+                )
+
+    # Now and then, one run at a time.
+
+    def now_and_then(self, i: int, step: int, plan: Due) -> None:
+        """What is rare, in the order of Algorithm 1."""
+        trainee, learner, at = self.trainees[i], self.trainees[i].learner, np.int32(step)
+        progress = trainee.progress
+        if plan.begin and trainee.spec.length_scale is None and not progress.measured:
+            self.runs.one(i, learner.measure)
+            progress.measured = True
+        if plan.session:
+            self.session(i, step, plan.session)
+        if plan.outer and progress.labels:
+            info = self.runs.one(i, learner.outer, trainee.latest_pairs(), at)
+            progress.outer_steps += 1
+            progress.latest["outer_loss"] = float(info["outer_loss"])
+        if plan.refresh:
+            report = {name: float(value) for name, value in self.runs.one(i, learner.refresh, at).items()}
+            progress.refreshes += 1
+            progress.latest.update({name: report[name] for name in ("beta", "intrinsic_mean") if name in report})
+            if "beta" in report:
+                self.warn(i, "bonus", health.bonus_zero(report["beta"], report["intrinsic_mean"]))
+        if plan.begin:
+            self.runs.one(i, learner.begin, at)
+            progress.updates += trainee.config.sac.reset_updates
+
+    def session(self, i: int, step: int, n: int) -> None:
+        """Select pairs, ask, and learn from the answers."""
+        trainee, runs = self.trainees[i], self.runs
+        learner, progress, preferences = trainee.learner, trainee.progress, trainee.preferences
+        drawn = trainee.candidate_starts(step)
+        if drawn is None:
+            self.warn(
+                i,
+                f"session at {step}",
+                f"The session at step {step} is put off: fewer than two complete episodes are longer than a segment "
+                f"of {trainee.config.queries.segment} steps.",
+            )
+            return
+        starts, episodes, first_steps = drawn
+        cut = (np.asarray(column) for column in runs.one(i, learner.cut, starts))
+        pool = Pairs(*cut, episodes, first_steps)
+        length_scale = float(runs.view(i, lambda run: run.length_scale))
+        variance = pool.observation[..., trainee.spec.position].var(axis=-2).max()
+        self.warn(i, "motion", health.nothing_moves(float(variance), length_scale))
+
+        def predict(observation: np.ndarray, action: np.ndarray) -> np.ndarray:
+            return np.asarray(runs.one(i, learner.summed_rewards, observation, action))
+
+        rule = trainee.rule if progress.sessions and trainee.rule else parts.first_selection()
+        context = Context(pool, predict, trainee.spec, length_scale)
+        chosen = rule(trainee.rng(Purpose.SELECT, step), context, n)
+        before = predict(pool.observation, pool.action).mean(axis=0)[chosen.index]
+        query = Query(pool.take(chosen.index), chosen.scores, probability_second(before))
+
+        sides = trainee.rng(Purpose.SIDES, step).integers(2, size=n)
+        ids = preferences.add(query, progress.sessions, step, trainee.config.seed, sides)
+        trainee.teacher.ask(ids, query)
+        answers = trainee.teacher.collect()
+        preferences.answer(answers, trainee.config.teacher, step)
+        progress.sessions += 1
+        progress.queried += n
+        progress.labels = preferences.arrays.count
+
+        self.judge_predictions(i, query, answers.labels)
+        if not progress.labels:
+            return
+        at = np.int32(step)
+        info = runs.one(i, learner.fit, trainee.labelled(), at)
+        progress.latest.update({name: float(value) for name, value in info.items()})
+        positions, count = preferences.preferred_positions(trainee.spec.position)
+        runs.one(i, learner.on_session, positions, np.int32(count), at)
+
+    def judge_predictions(self, i: int, query: Query, labels: Sequence[int | None]) -> None:
+        """Prospective accuracy: the model's prediction of new pairs before it is fitted to them."""
+        progress = self.trainees[i].progress
+        assert query.prediction is not None
+        decided = [
+            (probability > 0.5) == (label == Preferred.SECOND)
+            for probability, label in zip(query.prediction, labels, strict=True)
+            if label in (Preferred.FIRST, Preferred.SECOND)
+        ]
+        if not decided:
+            return
+        progress.latest["reward_accuracy"] = sum(decided) / len(decided)
+        if progress.sessions > 1:  # the model of the first session has learned nothing yet
+            progress.right.append(int(sum(decided)))
+            progress.decided.append(len(decided))
+            self.warn(i, "accuracy", health.accuracy_at_chance(progress.right, progress.decided))
+
+    # Looking back: evaluation, snapshots, checkpoints.
+
+    def look_back(self, i: int, step: int, last: bool) -> None:
+        """What is due before the action of ``step``; ``last``: the run ends or is interrupted here."""
+        trainee = self.trainees[i]
+        config, progress = trainee.config, trainee.progress
+        at_end = step == config.steps
+        if step > progress.evaluated and (step % config.evaluation.every == 0 or at_end):
+            with self.clock.part("evaluate"):
+                if not self.evaluate(i, step):
+                    return
+            if step % config.snapshot_every == 0 or at_end:
+                self.snapshot(i, step)
+            trainee.directory.append("timing.csv", self.clock.row(step))
+        if step > progress.step and (step % config.checkpoint_every == 0 or last):
+            with self.clock.part("checkpoint"):
+                trainee.save(self.runs[i], step)
+
+    def evaluate(self, i: int, step: int) -> bool:
+        """Judge the policy on fresh episodes; False if the environment broke."""
+        trainee = self.trainees[i]
+        config, progress = trainee.config, trainee.progress
+        actor = self.runs.view(i, lambda run: run.agent.average)
+        count = config.evaluation.episodes
+        first = -(-step // config.evaluation.every) * count
+        try:
+            episodes = judge(
+                lambda observation: np.asarray(self.policy(actor, observation)),
+                trainee.judged_in,
+                range(first, first + count),
+            )
+        except EpisodeFailed as error:
+            self.fail(i, step, str(error))
+            return False
+        result = summary(episodes)
+        trainee.directory.append(
+            "eval.csv", {"step": step, "labels": progress.labels, "queried": progress.queried, **result}
+        )
+        progress.evaluated, progress.success = step, result["success_rate"]
+        if result["success_rate"] is not None and progress.learned_returns and progress.labels:
+            progress.evaluations.append([result["success_rate"], float(np.mean(progress.learned_returns))])
+            success, learned = zip(*progress.evaluations, strict=True)
+            self.warn(i, "fall", health.success_falls(success, learned))
+        progress.learned_returns.clear()
+        return True
+
+    def snapshot(self, i: int, step: int) -> None:
+        """2,000 positions of the latest steps, and the samples behind f_P and f_E where there is PGE."""
+        trainee = self.trainees[i]
+        facts = self.runs.view(i, lambda run: run.replay.facts.observation)
+        latest = min(step, trainee.config.snapshot_every, trainee.config.capacity)
+        rows = trainee.rng(Purpose.SNAPSHOT, step).integers(step - latest, step, size=2000)
+        positions = np.asarray(facts)[rows % trainee.config.capacity][:, trainee.spec.position]
+        bonus = self.runs.view(i, lambda run: run.bonus)
+        behind = {}
+        if trainee.config.method.explore == "preference_guided" and bool(bonus.ready):
+            behind = {
+                "preferred": np.asarray(bonus.preferred),
+                "explored": np.asarray(bonus.curiosity.observation)[:, trainee.spec.position],
+                "intrinsic": np.asarray(bonus.intrinsic),
+                "beta": np.asarray(bonus.beta),
+            }
+        trainee.directory.snapshot(step, positions, behind)
+
+    def warn(self, i: int, kind: str, sentence: str | None) -> None:
+        """Tell a health warning once per run and kind, and keep it in the run directory."""
+        trainee = self.trainees[i]
+        if sentence is None or kind in trainee.progress.warned:
+            return
+        trainee.progress.warned.append(kind)
+        trainee.directory.warn(sentence)
+        self.watcher.say(f"Warning ({trainee.name}): {sentence}")
+
+    def fail(self, i: int, step: int, message: str) -> None:
+        """Stop one run, with a checkpoint at the beginning of ``step``; the others go on."""
+        trainee = self.trainees[i]
+        trainee.failure = message
+        if step > trainee.progress.step:
+            trainee.save(self.runs[i], step)
+        self.watcher.say(f"{trainee.name} is stopped at step {step}, with a checkpoint: {message}")
+
+
+def _fact(trainee: Trainee, happened: Step | None) -> Fact:
+    """A transition for the device; of a stopped run, anything of the right shape."""
+    if happened is None:
+        o, a = trainee.spec.observation_size, trainee.spec.action_size
+        zero, no = np.float32(0), np.bool_(False)
+        return Fact(np.zeros(o, np.float32), np.zeros(a, np.float32), zero, np.zeros(o, np.float32), no, no, np.int32(0))  # pyright: ignore[reportArgumentType]
+    return Fact(
+        happened.observation,
+        happened.action,
+        np.float32(happened.reward),
+        happened.next_observation,
+        np.bool_(happened.terminated),
+        np.bool_(happened.truncated),
+        np.int32(trainee.progress.episode),
+    )  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,87 @@
+"""A method is a row of data. An ablation is the row with a cell replaced."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from senior import explore, select
+from senior.types import BadInput
+
+MIXES = ("uniform", "curiosity")
+OUTER_STEPS = ("none", "bilevel")
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row of `senior methods`; every cell is an option of `senior train`."""
+
+    name: Annotated[str, tyro.conf.arg(name="method")] = "m-senior"
+    """Name of the row that the cells below start from."""
+    select: str = "motion_distinction"
+    """Which pairs to ask: uniform, entropy, disagreement, motion_distinction, none, or module:Name."""
+    explore: str = "preference_guided"
+    """Bonus on top of the learned reward: preference_guided, none, or module:Name."""
+    mix: str = "curiosity"
+    """Where batches come from: uniform (the whole replay), curiosity (a share from PGE's curiosity buffer)."""
+    outer: str = "bilevel"
+    """Outer step on the reward model: bilevel (Meta-Reward-Net), none."""
+
+    @property
+    def learns_reward(self) -> bool:
+        """False for plain SAC, which sees the true reward and asks nobody."""
+        return self.select != "none"
+
+    def check(self) -> None:
+        """Refuse cells that do not exist or do not go together."""
+        for cell, value, known in (
+            ("--select", self.select, (*select.RULES, "none")),
+            ("--explore", self.explore, (*explore.BONUSES, "none")),
+        ):
+            if value not in known and ":" not in value:
+                raise BadInput.unknown(cell, value, known)
+        for cell, value, known in (("--mix", self.mix, MIXES), ("--outer", self.outer, OUTER_STEPS)):
+            if value not in known:
+                raise BadInput.unknown(cell, value, known)
+        if not self.learns_reward:
+            for cell, value, idle in (
+                ("an outer step", self.outer, "none"),
+                ("a bonus", self.explore, "none"),
+                ("a curiosity mix", self.mix, "uniform"),
+            ):
+                if value != idle:
+                    raise BadInput(
+                        f"A method that asks nothing (--select none) has no reward model, so {cell} ({value}) "
+                        "makes no sense."
+                    )
+        if self.explore == "preference_guided" and self.mix != "curiosity":
+            raise BadInput(
+                "The bonus of PGE is paid on rows of the curiosity buffer, so --explore preference_guided needs "
+                "--mix curiosity."
+            )
+        if self.mix == "curiosity" and self.explore != "preference_guided":
+            raise BadInput(
+                "The curiosity buffer is filled by PGE, so --mix curiosity needs --explore preference_guided; "
+                "without PGE use --explore none --mix uniform."
+            )
+
+
+METHODS: dict[str, Method] = {
+    row.name: row
+    for row in (
+        Method("sac", select="none", explore="none", mix="uniform", outer="none"),
+        Method("pebble", select="entropy", explore="none", mix="uniform", outer="none"),
+        Method("mrn", select="disagreement", explore="none", mix="uniform", outer="bilevel"),
+        Method("p-senior", select="motion_distinction", explore="preference_guided", mix="curiosity", outer="none"),
+        Method("m-senior", select="motion_distinction", explore="preference_guided", mix="curiosity", outer="bilevel"),
+    )
+}
+
+
+def method(name: str) -> Method:
+    """The row of that name; `BadInput` with the nearest one if there is none."""
+    if name not in METHODS:
+        raise BadInput.unknown("method", name, METHODS)
+    return METHODS[name]

@@ -1,0 +1,56 @@
+"""From a name in the configuration to the part it means: a built-in's or anybody's ``module:Name``."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from dataclasses import asdict
+from typing import Any
+
+from senior.config import Config
+from senior.explore import BONUSES, Bonus
+from senior.select import RULES, Rule
+from senior.teachers import TEACHERS, Teacher
+from senior.types import BadInput, EnvSpec
+
+
+def load(name: str, known: dict[str, str], kind: str) -> Any:
+    """What ``name`` stands for: an entry of ``known`` or ``module:Name`` found from the working directory."""
+    path = known.get(name, name)
+    if ":" not in path:
+        raise BadInput.unknown(kind, name, known)
+    module, _, attribute = path.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except ImportError as error:
+        raise BadInput(f"The {kind} {name!r} cannot be imported: {error}.") from error
+    except AttributeError:
+        raise BadInput(f"The {kind} {name!r} does not exist: {module} holds no {attribute}.") from None
+
+
+def selection(config: Config) -> Rule:
+    """The selection rule of a run."""
+    rule = load(config.method.select, RULES, "selection rule")
+    return rule(**asdict(config.mds)) if config.method.select == "motion_distinction" else rule
+
+
+def first_selection() -> Rule:
+    """The rule of every first session, whatever the scheme: nothing is known yet."""
+    return load("uniform", RULES, "selection rule")
+
+
+def bonus(config: Config, spec: EnvSpec) -> Bonus:
+    """The exploration bonus of a run."""
+    make = load(config.method.explore, BONUSES, "bonus")
+    if config.method.explore != "preference_guided":
+        return make(spec)
+    pge = config.pge
+    return make(spec, pge.capacity, pge.bandwidth, pge.beta, pge.decay, pge.clock)
+
+
+def teacher(config: Config) -> Teacher:
+    """Who answers in a run."""
+    return load(config.teacher, TEACHERS, "teacher")()

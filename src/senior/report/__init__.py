@@ -1,0 +1,1 @@
+"""From result files to figures. Reads files only and never imports JAX."""

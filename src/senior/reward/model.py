@@ -1,0 +1,130 @@
+"""The reward ensemble and its Bradley-Terry fit (Eq. 1 and 2; PEBBLE).
+
+Each member is a perceptron on (observation, action) with LeakyReLU and a tanh at its end; the learned reward
+is the mean over the members, in [-1, 1]. The logit of a segment is the plain sum of its rewards.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from senior.agent.networks import MLP, adam, apply_mlp, descend, fan_in_uniform, init_mlp
+from senior.types import Preferred
+
+
+class RewardModel(NamedTuple):
+    """Members (leading axis) with one Adam over all of them, and the outer step's own Adam where it has one."""
+
+    members: MLP
+    adam: optax.OptState
+    outer_adam: optax.OptState
+
+
+class Labelled(NamedTuple):
+    """Labelled pairs in arrays of fixed capacity ``n``; the first ``count`` rows hold labels."""
+
+    observation: Float[Array, "n 2 H o"]
+    action: Float[Array, "n 2 H a"]
+    label: Int[Array, " n"]
+    count: Int[Array, ""]
+
+
+class FitNumbers(NamedTuple):
+    """Numeric settings of a fit, traced."""
+
+    rate: Float[Array, ""] | float
+    epochs: Int[Array, ""] | int
+    stop_accuracy: Float[Array, ""] | float
+
+
+def init(key: PRNGKeyArray, members: int, size_in: int, layers: int, width: int) -> RewardModel:
+    """A new ensemble; every member from its own key."""
+    made = jax.vmap(lambda k: init_mlp(k, size_in, layers, width, 1, fan_in_uniform))(
+        jax.random.split(key, members)
+    )
+    return RewardModel(made, adam.init(made), adam.init(made))  # pyright: ignore[reportArgumentType]
+
+
+def member_reward(
+    member: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"]
+) -> Float[Array, "*b"]:
+    """Reward of one member, in [-1, 1]."""
+    x = jnp.concatenate([observation, action], axis=-1)
+    return jnp.tanh(apply_mlp(member, x, jax.nn.leaky_relu)[..., 0])
+
+
+def rewards(
+    members: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"]
+) -> Float[Array, "members *b"]:
+    """Reward of every member."""
+    return jax.vmap(member_reward, in_axes=(0, None, None))(members, observation, action)
+
+
+def targets(label: Int[Array, " n"]) -> Float[Array, "n 2"]:
+    """(1, 0) where the first is preferred, (0, 1) where the second is, (0.5, 0.5) where they are equal."""
+    second = jnp.where(label == Preferred.EQUAL, 0.5, label.astype(jnp.float32))
+    return jnp.stack([1 - second, second], axis=-1)
+
+
+def cross_entropy(logits: Float[Array, "*n 2"], target: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
+    """Bradley-Terry's loss of each pair (Eq. 2)."""
+    return -jnp.sum(target * jax.nn.log_softmax(logits), axis=-1)
+
+
+def fit(
+    model: RewardModel, labelled: Labelled, key: PRNGKeyArray, batch: int, numbers: FitNumbers
+) -> tuple[RewardModel, dict[str, Array]]:
+    """Fit all members to all labels: up to ``epochs`` passes in mini-batches of ``batch`` pairs.
+
+    Every member sees the labels in an order of its own; the members' losses are summed and one Adam step is
+    taken per mini-batch. The fit ends after an epoch whose accuracy, measured while it was trained, exceeds
+    ``stop_accuracy``. With no label nothing changes. Shapes do not depend on the number of labels.
+    """
+    capacity = labelled.label.shape[0]
+    batch = min(batch, capacity)
+    count = labelled.count
+    n_members = model.members.weights[0].shape[0]
+    target = targets(labelled.label)
+
+    def loss_of(members: MLP, rows: Int[Array, "members b"], valid: Bool[Array, " b"]) -> tuple[Array, Array]:
+        def of_member(member: MLP, own: Int[Array, " b"]) -> tuple[Array, Array]:
+            logits = member_reward(member, labelled.observation[own], labelled.action[own]).sum(axis=-1)
+            loss = jnp.sum(cross_entropy(logits, target[own]) * valid) / jnp.maximum(valid.sum(), 1)
+            right = (logits[:, 1] > logits[:, 0]) == (labelled.label[own] == Preferred.SECOND)
+            return loss, jnp.sum(right & valid & (labelled.label[own] != Preferred.EQUAL))
+
+        losses, right = jax.vmap(of_member)(members, rows)
+        return losses.sum(), right.sum()
+
+    def epoch(carry: tuple[RewardModel, Array, Array]) -> tuple[RewardModel, Array, Array]:
+        model, done, _ = carry
+        draw = jax.random.uniform(jax.random.fold_in(key, done), (n_members, capacity))
+        order = jnp.argsort(jnp.where(jnp.arange(capacity) < count, draw, jnp.inf), axis=1)
+        order = jnp.pad(order, ((0, 0), (0, -capacity % batch)))
+
+        def minibatch(i: Array, carry: tuple[RewardModel, Array]) -> tuple[RewardModel, Array]:
+            model, right = carry
+            rows = jax.lax.dynamic_slice_in_dim(order, i * batch, batch, axis=1)
+            valid = i * batch + jnp.arange(batch) < count
+            (_, hits), gradient = jax.value_and_grad(loss_of, has_aux=True)(model.members, rows, valid)
+            members, state = descend(model.members, gradient, model.adam, numbers.rate)
+            return model._replace(members=members, adam=state), right + hits
+
+        batches = (count + batch - 1) // batch
+        model, right = jax.lax.fori_loop(0, batches, minibatch, (model, jnp.zeros((), jnp.int32)))
+        return model, done + 1, right / (n_members * jnp.maximum(decided, 1))
+
+    decided = jnp.sum((labelled.label != Preferred.EQUAL) & (jnp.arange(capacity) < count))
+
+    def wanted(carry: tuple[RewardModel, Array, Array]) -> Array:
+        _, done, accuracy = carry
+        return (count > 0) & (done < numbers.epochs) & (accuracy <= numbers.stop_accuracy)
+
+    start = (model, jnp.zeros((), jnp.int32), jnp.zeros(()))
+    model, epochs, accuracy = jax.lax.while_loop(wanted, epoch, start)
+    return model, {"fit_epochs": epochs, "fit_accuracy": accuracy}

@@ -1,0 +1,234 @@
+"""A run's directory: its files, their columns, and how long each was at a checkpoint (README, "The run directory").
+
+CSV files are the truth; TensorBoard mirrors them. Nothing that depends on the clock is written outside
+``timing.csv``, ``tensorboard/`` and the time of an answer, so equal seeds give equal files.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import platform
+import shutil
+import subprocess
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tensorboardX import SummaryWriter
+
+from senior.checkpoint import Damaged, pack, unpack, write_atomically
+from senior.config import Config, to_json
+from senior.types import BadInput, EnvSpec
+
+EVAL = ("step", "labels", "queried", "episodes", "success_rate", "return_mean", "return_std")
+TRAIN = (
+    "step",
+    "episode",
+    "episode_length",
+    "episode_return",
+    "episode_success",
+    "learned_return",
+    "queried",
+    "labels",
+    "reward_accuracy",
+    "fit_accuracy",
+    "fit_epochs",
+    "outer_steps",
+    "outer_loss",
+    "refreshes",
+    "beta",
+    "intrinsic_mean",
+    "bonus_mean",
+    "batch_reward",
+    "critic_loss",
+    "actor_loss",
+    "q",
+    "alpha",
+    "entropy",
+)
+TIMING = (
+    "step",
+    "seconds",
+    "steps_per_second",
+    "act",
+    "environment",
+    "update",
+    "store",
+    "session",
+    "evaluate",
+    "checkpoint",
+)
+TABLES = {"eval.csv": EVAL, "train.csv": TRAIN, "timing.csv": TIMING}
+PACKAGES = ("senior-rl", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "metaworld", "mujoco")
+REWARD_VERSION = "v2"
+
+
+class RunDirectory:
+    """The open files of one run."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.checkpoints = path / "checkpoints"
+        self._board: SummaryWriter | None = None
+
+    @property
+    def preferences(self) -> Path:
+        return self.path / "preferences.sqlite"
+
+    def check_free(self) -> None:
+        """`BadInput` if there is something in its place."""
+        if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+            raise BadInput(f"{self.path} exists and is not empty; choose another --out, or resume the run in it.")
+
+    def create(self, config: Config, protocol: Mapping[str, Any]) -> None:
+        """A new directory; `BadInput` if there is something in its place or it cannot be written."""
+        self.check_free()
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            for name, columns in TABLES.items():
+                (self.path / name).write_text(",".join(columns) + "\n")
+            (self.path / "warnings.log").touch()
+            content = {"config": to_json(config), "protocol": dict(protocol)}
+            write_atomically(self.path / "config.json", (json.dumps(content, indent=2) + "\n").encode())
+        except OSError as error:
+            raise BadInput(f"{self.path} cannot be written: {error.strerror}.") from error
+
+    def append(self, table: str, row: Mapping[str, Any]) -> None:
+        """One row; numbers that are missing or None stay empty."""
+        columns = TABLES[table]
+        unknown = set(row) - set(columns)
+        assert not unknown, f"{table} has no column {unknown}"
+        line = io.StringIO()
+        csv.writer(line, lineterminator="\n").writerow([_text(row.get(name)) for name in columns])
+        with open(self.path / table, "a") as file:
+            file.write(line.getvalue())
+        board, step = self._tensorboard(), int(row["step"])
+        for name, value in row.items():
+            if value is not None and name != "step":
+                board.add_scalar(f"{table.removesuffix('.csv')}/{name}", float(value), step)
+
+    def warn(self, sentence: str) -> None:
+        """Keep a health warning."""
+        with open(self.path / "warnings.log", "a") as file:
+            file.write(sentence + "\n")
+
+    def lengths(self) -> dict[str, int]:
+        """Bytes in every append-only file, which are then on the disk."""
+        found = {}
+        for name in (*TABLES, "warnings.log"):
+            with open(self.path / name, "rb+") as file:
+                os.fsync(file.fileno())
+                found[name] = file.seek(0, os.SEEK_END)
+        return found
+
+    def truncate(self, lengths: Mapping[str, int], step: int) -> None:
+        """Cut the append-only files back to a checkpoint's lengths and forget snapshots after its step."""
+        for name, columns in TABLES.items():
+            os.truncate(self.path / name, lengths.get(name, len(",".join(columns)) + 1))
+        os.truncate(self.path / "warnings.log", lengths.get("warnings.log", 0))
+        for path in (self.path / "bonus").glob("step-*.npz"):
+            if int(path.stem.removeprefix("step-")) > step:
+                path.unlink()
+        self._board = SummaryWriter(str(self.path / "tensorboard"), purge_step=step)
+
+    def snapshot(self, step: int, positions: np.ndarray, bonus: Mapping[str, np.ndarray]) -> None:
+        """Add visited positions ``[n, d]`` to ``positions.npz``; what is behind f_P and f_E goes to ``bonus/``."""
+        path = self.path / "positions.npz"
+        try:
+            kept = unpack(path) if path.exists() else {}
+        except Damaged:
+            kept = {}
+        kept = {name: array for name, array in kept.items() if int(name.removeprefix("step-")) < step}
+        write_atomically(path, pack({**kept, f"step-{step:010d}": positions}))
+        if bonus:
+            (self.path / "bonus").mkdir(exist_ok=True)
+            write_atomically(self.path / "bonus" / f"step-{step:010d}.npz", pack(dict(bonus)))
+
+    def save_policy(self, actor: Mapping[str, np.ndarray]) -> None:
+        """The policy as it is now: weights and biases per layer."""
+        (self.path / "policy").mkdir(exist_ok=True)
+        write_atomically(self.path / "policy" / "actor.npz", pack(dict(actor)))
+
+    def forget_everything(self) -> None:
+        """Back to the beginning, for a run that was interrupted before its first checkpoint."""
+        self.truncate({}, -1)
+        (self.path / "positions.npz").unlink(missing_ok=True)
+        for name in ("checkpoints", "bonus", "policy"):
+            shutil.rmtree(self.path / name, ignore_errors=True)
+
+    def close(self) -> None:
+        if self._board is not None:
+            self._board.close()
+
+    def _tensorboard(self) -> SummaryWriter:
+        if self._board is None:
+            self._board = SummaryWriter(str(self.path / "tensorboard"))
+        return self._board
+
+
+def read_protocol(path: Path) -> dict[str, Any]:
+    """The protocol in a run's ``config.json``."""
+    return json.loads((path / "config.json").read_text())["protocol"]
+
+
+def protocol(spec: EnvSpec, device: str) -> dict[str, Any]:
+    """What a number of this run depends on beside its configuration."""
+    return {
+        "environment": spec.name,
+        "reward_version": REWARD_VERSION,
+        "horizon": spec.horizon,
+        "observation_size": spec.observation_size,
+        "action_size": spec.action_size,
+        "position": [spec.position.start, spec.position.stop],
+        "device": device,
+        "threads": threads(),
+        "machine": f"{platform.system()} {platform.machine()}, {_processor()}",
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in PACKAGES},
+        "git_commit": _commit(),
+    }
+
+
+def threads() -> int:
+    """Processors this process may use; XLA's thread pool has as many."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or "unknown processor"
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """The commit of the source tree this package runs from, if it is one."""
+    source = Path(__file__).resolve().parent
+    try:
+        shown = subprocess.run(
+            ["git", "-C", str(source), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return shown.stdout.strip() if source.parent.name == "src" else None
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, (int, np.integer, str)):
+        return str(value)
+    return format(float(value), ".9g")

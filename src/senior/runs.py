@@ -1,0 +1,134 @@
+"""Many runs in one program: functions of one run, lifted over all of them.
+
+On a CPU the lift is a loop: each run then equals, bit for bit, the same seed trained alone, and vmap was
+measured to gain nothing. On a GPU it is ``vmap``: the runs' arrays are stacked and one program serves them all.
+What is rare (sessions, fits, refreshes) is called for one run at a time, by index.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from senior.learner import Run
+from senior.types import BadInput
+
+Lift = Literal["loop", "vmap"]
+OfOneRun = Callable[..., tuple[Run, Any]]
+
+
+class PerRun(Protocol):
+    """Results of all runs; those of run ``i`` are ``results[i]``."""
+
+    def __getitem__(self, i: int) -> Any: ...
+
+
+class Runs:
+    """The traced states of R runs. Functions are compiled once each and own the state they are given."""
+
+    def __init__(self, states: Sequence[Run], lift: Lift) -> None:
+        self.size = len(states)
+        self.lift = lift
+        self._loop = list(states) if lift == "loop" else []
+        self._stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states) if lift == "vmap" else None
+        self.compiled: dict[tuple[str, str], Any] = {}
+
+    def __getitem__(self, i: int) -> Run:
+        """The state of run ``i``. Do not keep it across a call: its arrays are given away."""
+        return self._loop[i] if self.lift == "loop" else jax.tree.map(lambda leaf: leaf[i], self._stack)
+
+    def __setitem__(self, i: int, state: Run) -> None:
+        if self.lift == "loop":
+            self._loop[i] = state
+        else:
+            self._stack = jax.tree.map(lambda leaf, new: leaf.at[i].set(new), self._stack, state)
+
+    def view(self, i: int, pick: Callable[[Run], Any]) -> Any:
+        """A part of the state of run ``i``, without copying the rest. Not to be kept either."""
+        if self.lift == "loop":
+            return pick(self._loop[i])
+        return jax.tree.map(lambda leaf: leaf[i], pick(self._stack))  # pyright: ignore[reportArgumentType]
+
+    def every(self, of_one: OfOneRun, active: Sequence[bool], *columns: Sequence[Any]) -> PerRun:
+        """Call a function for all active runs; each column holds one argument per run.
+
+        Under vmap inactive runs are computed too and their results mean nothing.
+        """
+        function = self._compile(of_one, "every")
+        if self.lift == "vmap":
+            stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *column) for column in columns]
+            self._stack, results = function(self._stack, *stacked)
+            return _Stacked(results)
+        results: list[Any] = [None] * self.size
+        for i in range(self.size):
+            if active[i]:
+                self._loop[i], results[i] = function(self._loop[i], *(column[i] for column in columns))
+        return results
+
+    def one(self, i: int, of_one: OfOneRun, *arguments: Any) -> Any:
+        """Call a function for run ``i`` alone."""
+        function = self._compile(of_one, "one")
+        if self.lift == "vmap":
+            self._stack, result = function(self._stack, jnp.int32(i), *arguments)
+        else:
+            self._loop[i], result = function(self._loop[i], *arguments)
+        return result
+
+    def _compile(self, of_one: OfOneRun, use: str) -> Any:
+        key = (of_one.__name__, use if self.lift == "vmap" else "")
+        if key not in self.compiled:
+            if self.lift == "loop":
+                function = of_one
+            elif use == "every":
+                function = jax.vmap(of_one)
+            else:
+                function = _at(of_one)
+            self.compiled[key] = jax.jit(function, donate_argnums=0)
+        return self.compiled[key]
+
+
+class _Stacked:
+    """Results with a leading run axis, fetched as one when somebody looks."""
+
+    def __init__(self, results: Any) -> None:
+        self._results = results
+
+    def __getitem__(self, i: int) -> Any:
+        self._results = jax.device_get(self._results)
+        return jax.tree.map(lambda leaf: leaf[i], self._results)
+
+
+def _at(of_one: OfOneRun) -> Callable[..., tuple[Any, Any]]:
+    def call(stack: Any, i: Any, *arguments: Any) -> tuple[Any, Any]:
+        state, result = of_one(jax.tree.map(lambda leaf: leaf[i], stack), *arguments)
+        return jax.tree.map(lambda leaf, new: leaf.at[i].set(new), stack, state), result
+
+    return call
+
+
+def prepare_device(wanted: str) -> str:
+    """Choose where to compute and switch the compilation cache on; returns ``cpu`` or ``gpu``.
+
+    Raises `BadInput` if a GPU is asked for and there is none.
+    """
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "senior" / "xla"
+    if jax.config.jax_compilation_cache_dir is None:
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    if wanted == "cpu":
+        jax.config.update("jax_platforms", "cpu")
+        return "cpu"
+    found = jax.default_backend()
+    if wanted == "gpu" and found != "gpu":
+        raise BadInput("--device gpu: JAX finds no GPU here; install the extra senior-rl[gpu] or use --device cpu.")
+    return "gpu" if found == "gpu" else "cpu"
+
+
+def lift_for(device: str) -> Lift:
+    """How runs are put into one program on that device."""
+    return "vmap" if device == "gpu" else "loop"

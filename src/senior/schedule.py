@@ -1,0 +1,80 @@
+"""What is due at each step of a run: pure arithmetic on the configuration, so that it can be tried without physics.
+
+A step is the number of environment steps taken before the action of that step. Pre-training ends at step
+``until``: the first session takes place there, the critics are renewed and 100 updates follow instead of that
+step's own. After the budget is spent, outer steps stop (unless ``after_budget``); the bonus goes on.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from senior.config import Config
+
+
+class Due(NamedTuple):
+    """What happens at one step, in this order, between choosing an action and storing what it did."""
+
+    random: bool  # the action is uniformly random
+    session: int  # pairs to ask; 0: no session
+    outer: bool
+    refresh: bool
+    begin: bool  # renew the critics and make the first updates
+    pretrain: bool  # an update on state entropy
+    update: bool  # an ordinary update
+
+
+def due(config: Config, step: int, queried: int) -> Due:
+    """What is due at ``step`` for a run that has asked ``queried`` pairs.
+
+    A session that was put off for lack of episodes is due again at the next multiple of K.
+    """
+    until, random_steps = config.pretraining.until, config.pretraining.random_steps
+    random = step < random_steps
+    if not config.method.learns_reward:
+        return Due(random, 0, False, False, False, False, update=step > random_steps)
+    if step < until:
+        return Due(random, 0, False, False, False, pretrain=step > random_steps, update=False)
+    queries = config.queries
+    left = queries.budget - queried
+    on_time = step == until or (step - until) % queries.every == 0
+    session = min(queries.per_session, left) if on_time and left > 0 else 0
+    budget_left = left - session > 0
+    return Due(
+        random=False,
+        session=session,
+        outer=config.method.outer == "bilevel"
+        and step > until
+        and step % config.bilevel.every == 0
+        and (budget_left or config.bilevel.after_budget),
+        refresh=config.method.explore != "none" and (step == until or step % config.pge.every == 0),
+        begin=step == until,
+        pretrain=False,
+        update=step > until,
+    )
+
+
+class Counts(NamedTuple):
+    """What a whole run amounts to."""
+
+    sessions: int
+    queried: int
+    last_session: int  # step
+    outer_steps: int
+    refreshes: int
+    pretraining_updates: int
+    updates: int  # the ones right after pre-training included
+
+
+def plan(config: Config) -> Counts:
+    """Count a run without physics, assuming that every session finds its episodes."""
+    sessions = queried = last = outer = refreshes = pretraining = updates = 0
+    for step in range(config.steps):
+        now = due(config, step, queried)
+        if now.session:
+            sessions, queried, last = sessions + 1, queried + now.session, step
+        outer += now.outer
+        refreshes += now.refresh
+        pretraining += now.pretrain
+        updates += now.update * config.sac.updates + now.begin * config.sac.reset_updates
+    return Counts(sessions, queried, last, outer, refreshes, pretraining, updates)

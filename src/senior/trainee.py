@@ -1,0 +1,254 @@
+"""The host's half of one run: its environments, teacher, preferences and files, and where it stands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from senior import checkpoint, envs, parts
+from senior.checkpoint import Damaged
+from senior.config import Config
+from senior.envs.vector import TRAINING, Environments, Failure, Step
+from senior.evaluate import DURING_TRAINING
+from senior.learner import Learner, Purpose, Run
+from senior.preferences import Preferences
+from senior.reward.bilevel import FirstSteps
+from senior.reward.model import Labelled
+from senior.rundir import RunDirectory
+from senior.types import BadInput, EnvSpec, Pairs
+
+
+@dataclass
+class Progress:
+    """Where a run stands; goes into every checkpoint as JSON."""
+
+    step: int = 0
+    evaluated: int = 0  # the step of the last evaluation
+    written: int = 0  # facts that are in chunks on the disk
+    last_pair: int = 0  # number of the last row of the preference file
+    queried: int = 0
+    labels: int = 0
+    success: float | None = None  # of the last evaluation
+    sessions: int = 0
+    outer_steps: int = 0
+    refreshes: int = 0
+    pretraining_updates: int = 0
+    updates: int = 0
+    episode: int = 0
+    elapsed: int = 0
+    episode_return: float = 0.0
+    episode_success: float | None = None
+    recent: list[list[int]] = field(default_factory=list)  # [episode, first row, length] of complete episodes
+    measured: bool = False  # the length scale was taken from the data
+    right: list[int] = field(default_factory=list)  # per session, new pairs predicted rightly before the fit
+    decided: list[int] = field(default_factory=list)  # of so many
+    learned_returns: list[float] = field(default_factory=list)  # of the episodes since the last evaluation
+    evaluations: list[list[float]] = field(default_factory=list)  # [success, mean learned return]
+    latest: dict[str, float] = field(default_factory=dict)  # numbers of rare events, for the next row of the log
+    lengths: dict[str, int] = field(default_factory=dict)  # bytes of the append-only files
+    warned: list[str] = field(default_factory=list)
+
+
+def make_environment(config: Config, render: bool = False) -> tuple[Any, EnvSpec]:
+    """The environment of a configuration."""
+    task = None if config.env else config.task
+    return envs.make(task, config.env, config.position, config.length_scale, config.horizon, render)
+
+
+class Trainee:
+    """One run, as its host sees it. `begin` or `resume` gives it its state."""
+
+    def __init__(self, config: Config, path: Path, learner: Learner) -> None:
+        self.config = config
+        self.spec = learner.spec
+        self.learner = learner
+        self.directory = RunDirectory(path)
+        self.progress = Progress()
+        self.failure: str | None = None
+        self.environment = Environments(lambda: make_environment(config), [config.seed], TRAINING)
+        self.judged_in = Environments(lambda: make_environment(config), [config.seed], DURING_TRAINING)
+        self.rule = parts.selection(config) if config.method.learns_reward else None
+        self.teacher = parts.teacher(config)
+        self._preferences: Preferences | None = None
+
+    @property
+    def name(self) -> str:
+        return f"seed {self.config.seed}"
+
+    @property
+    def preferences(self) -> Preferences:
+        """The run's preference file, opened at first use."""
+        if self._preferences is None:
+            queries, spec = self.config.queries, self.spec
+            self._preferences = Preferences(
+                self.directory.preferences,
+                queries.budget,
+                queries.segment,
+                spec.observation_size,
+                spec.action_size,
+            )
+        return self._preferences
+
+    def rng(self, purpose: Purpose, step: int) -> np.random.Generator:
+        """Random numbers of the host, by purpose and step like the device's."""
+        return np.random.default_rng([self.config.seed, purpose, step])
+
+    # Beginning, saving, resuming.
+
+    def begin(self) -> Run:
+        """A new run in a new directory."""
+        failed = self.environment.begin(0, 0)
+        if failed:
+            raise BadInput(failed.message)
+        self._open_preferences()
+        return self.learner.init(self.config.seed)
+
+    def resume(self, tell: Callable[[str], None]) -> Run:
+        """The newest checkpoint that can be read, or the beginning if there is none yet."""
+        found = checkpoint.newest(
+            self.directory.checkpoints, lambda: self.learner.init(self.config.seed), tell
+        )
+        if found is None:
+            if any(self.directory.checkpoints.glob("step-*.npz")):
+                raise BadInput(f"No checkpoint in {self.directory.path} can be read; the run cannot be resumed.")
+            self.directory.forget_everything()
+            self._open_preferences(truncate_to=0)
+            failed = self.environment.begin(0, 0)
+            if failed:
+                raise BadInput(failed.message)
+            return self.learner.init(self.config.seed)
+        step, run, progress = found
+        self.progress = Progress(**progress)
+        self.directory.truncate(self.progress.lengths, step)
+        self._open_preferences(truncate_to=self.progress.last_pair)
+        self._relive(run)
+        return run
+
+    def _open_preferences(self, truncate_to: int | None = None) -> None:
+        """Plain SAC asks nothing and has no preference file."""
+        if self.config.method.learns_reward:
+            if truncate_to is not None:
+                self.preferences.truncate(truncate_to)
+
+    def _relive(self, run: Run) -> None:
+        """Bring the environment to where the run stands, by the running episode's seed and actions."""
+        rows = np.arange(int(run.replay.count) - self.progress.elapsed, int(run.replay.count))
+        rows = rows % run.replay.capacity
+        steps = self.environment.restore(0, self.progress.episode, np.asarray(run.replay.facts.action)[rows])
+        if isinstance(steps, Failure):
+            raise BadInput(f"The run cannot go on: {steps.message}")
+        stored = np.asarray(run.replay.facts.next_observation)[rows]
+        if steps and not np.array_equal(np.stack([step.next_observation for step in steps]), stored):
+            raise BadInput(
+                f"The environment {self.spec.name} does not repeat an episode from its seed and actions, so the run in "
+                f"{self.directory.path} cannot be resumed exactly; its reset must honour the seed it is given."
+            )
+
+    def save(self, run: Run, step: int) -> None:
+        """Write a checkpoint at the beginning of ``step``, and the policy beside it."""
+        progress = self.progress
+        progress.step = step
+        progress.lengths = self.directory.lengths()
+        progress.last_pair = self.preferences.last if self.config.method.learns_reward else 0
+        progress.written = checkpoint.save(
+            self.directory.checkpoints, step, run, asdict(progress), progress.written
+        )
+        self.directory.save_policy({**policy_arrays(run), "step": np.int64(step)})
+
+    def close(self) -> None:
+        """Close environments and files."""
+        self.environment.close()
+        self.judged_in.close()
+        self.directory.close()
+        if self._preferences is not None:
+            self._preferences.close()
+            self._preferences = None
+
+    # What happened.
+
+    def record(self, step: int, happened: Step, learned_return: Any, info: dict[str, Any] | None) -> None:
+        """Count a step that was taken at ``step``; at the end of an episode write its row."""
+        progress = self.progress
+        progress.elapsed += 1
+        progress.episode_return += happened.reward
+        if happened.success is not None:
+            progress.episode_success = max(progress.episode_success or 0.0, happened.success)
+        if not happened.ended:
+            return
+        learned = float(learned_return) if self.config.method.learns_reward else None
+        numbers = {name: float(value) for name, value in (info or {}).items()}
+        self.directory.append(
+            "train.csv",
+            {
+                "step": step + 1,
+                "episode": progress.episode,
+                "episode_length": progress.elapsed,
+                "episode_return": progress.episode_return,
+                "episode_success": progress.episode_success,
+                "learned_return": learned,
+                "queried": progress.queried,
+                "labels": progress.labels,
+                "outer_steps": progress.outer_steps,
+                "refreshes": progress.refreshes,
+                **progress.latest,
+                **numbers,
+            },
+        )
+        if learned is not None:
+            progress.learned_returns.append(learned)
+        progress.recent.append([progress.episode, step + 1 - progress.elapsed, progress.elapsed])
+        del progress.recent[: -self.config.queries.episodes]
+        progress.episode += 1
+        progress.elapsed, progress.episode_return, progress.episode_success = 0, 0.0, None
+
+    # What can be asked and what was said, as arrays.
+
+    def candidate_starts(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Rows, episodes and first steps, each ``[P, 2]``, of independently drawn candidate pairs.
+
+        Episodes are uniform over the latest complete ones that are longer than a segment and still in the replay;
+        starts are uniform, the episode's last step excluded. None if there are fewer than two such episodes.
+        """
+        queries, stored = self.config.queries, step
+        usable = [
+            (episode, first, length)
+            for episode, first, length in self.progress.recent
+            if length > queries.segment and first >= stored - self.config.capacity
+        ]
+        if len(usable) < 2:
+            return None
+        episode, first, length = np.array(usable).T
+        rng = self.rng(Purpose.CANDIDATES, step)
+        shape = (queries.pool * queries.per_session, 2)
+        drawn = rng.integers(len(usable), size=shape)
+        start = rng.integers(length[drawn] - queries.segment)
+        return (first[drawn] + start).astype(np.int32), episode[drawn], start
+
+    def labelled(self) -> Labelled:
+        """All labels so far, in arrays of the budget's size."""
+        observation, action, label, count = self.preferences.arrays
+        return Labelled(observation, action, label, np.int32(count))  # pyright: ignore[reportArgumentType]
+
+    def latest_pairs(self) -> FirstSteps:
+        """First steps of the M most recent labelled pairs, for the outer step."""
+        observation, action, label, count = self.preferences.arrays
+        m = self.config.queries.per_session
+        rows = np.arange(count - m, count)
+        weight = (rows >= 0).astype(np.float32)
+        rows = np.maximum(rows, 0)
+        return FirstSteps(observation[rows, :, 0], action[rows, :, 0], label[rows], weight)  # pyright: ignore[reportArgumentType]
+
+
+def policy_arrays(run: Run) -> dict[str, np.ndarray]:
+    """The delivered policy: per layer ``weight_i [in, out]`` and ``bias_i [out]``."""
+    actor = run.agent.average
+    return {
+        f"{kind}_{i}": np.asarray(layer)
+        for kind, layers in (("weight", actor.weights), ("bias", actor.biases))
+        for i, layer in enumerate(layers)
+    }

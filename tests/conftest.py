@@ -1,0 +1,34 @@
+"""What a test process needs before JAX is imported: the CPU, a core of its own, a store of compiled code."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+# Workers, checkouts and later runs share it; JAX's keys tell versions and machines apart.
+COMPILED = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "senior-rl" / "tests"
+KEPT_SECONDS = 14 * 24 * 3600
+WORKER = os.environ.get("PYTEST_XDIST_WORKER")
+
+os.environ["JAX_PLATFORMS"] = "cpu"
+os.environ["JAX_COMPILATION_CACHE_DIR"] = str(COMPILED)
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+
+# Two workers with a thread for each core would only wait for each other.
+if WORKER and sys.platform == "linux":
+    cores = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {cores[int(WORKER.removeprefix("gw")) % len(cores)]})
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # An entry that another worker is still writing, or a killed run left half-written, is compiled again.
+    config.addinivalue_line("filterwarnings", "ignore:Error (reading|writing) persistent compilation cache")
+
+
+def pytest_sessionstart() -> None:
+    if WORKER is None:
+        for entry in COMPILED.glob("*-cache"):
+            if time.time() - entry.stat().st_mtime > KEPT_SECONDS:
+                entry.unlink(missing_ok=True)
