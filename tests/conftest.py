@@ -14,6 +14,7 @@ WORKER = os.environ.get("PYTEST_XDIST_WORKER")
 
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(COMPILED)
+os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"  # as senior.runs.prepare_device sets it, and why
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
 # Two workers with a thread for each core would only wait for each other.

@@ -158,8 +158,9 @@ def _train(arguments: list[str]) -> int:
     start = preset(known.preset, known.task, known.method)
     text = (
         "Train one run, or several in one program. Defaults below are those of the --task, --method and --preset "
-        "given; give these first to see yours.\n\nThe quick preset changes from the paper (for door-close):\n"
-        + quick_changes()
+        "given. The quick preset is for a CPU and changes from the paper's numbers (here those for door-close): "
+        + quick_changes().replace("\n", "; ")
+        + "."
     )
     options = parse(TrainOptions, arguments, TrainOptions(config=start), "train", text)
     from senior import program
@@ -253,7 +254,15 @@ def _bench(arguments: list[str]) -> int:
     options = parse(BenchOptions, arguments, None, "bench")
     from senior import bench
 
-    bench.run(options.method, options.preset, options.task, options.steps, options.runs, options.device, options.json)
+    bench.run(
+        options.method,
+        options.preset,
+        options.task,
+        options.steps,
+        options.runs,
+        options.device,
+        options.json,
+    )
     return DONE
 
 
@@ -328,6 +337,7 @@ def _unknown_option(kind: type[Any], option: str, default: Any, command: str) ->
 
 def _one_sentence(box: str) -> str:
     """The text inside tyro's box, without its frame, hints and line breaks."""
+    box = re.split(r"Argument helptext|─{10,}\s*Argument", box)[0]
     lines = [re.sub(r"[│╭╮╰╯─┌┐└┘]|\x1b\[[0-9;]*m", " ", line).strip() for line in box.splitlines()]
     kept: list[str] = []
     for line in lines:
@@ -335,6 +345,7 @@ def _one_sentence(box: str) -> str:
             continue
         kept.append(line)
     sentence = " ".join(" ".join(kept).split())
+    sentence = re.sub(r"^(Value error|Missing argument|Required options|Invalid choice)\s+(?=[A-Z])", "", sentence)
     return sentence if sentence.endswith((".", "!", "?")) else sentence + "."
 
 

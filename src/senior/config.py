@@ -53,7 +53,8 @@ class SAC:
     alpha_rate: float = 1e-4
     """Adam's learning rate for the temperature."""
     rate_end: float = 1.0
-    """Factor on the actor's and critics' learning rates at the last step, reached along a straight line from pre-training's end. 1: constant, as in the papers."""
+    """Factor on the actor's and critics' learning rates at the last step, reached along a straight line from the end
+    of pre-training. 1: constant, as in the papers."""
     discount: float = 0.99
     """Discount gamma."""
     tau: float = 0.005
@@ -67,7 +68,8 @@ class SAC:
     reset_updates: int = 100
     """Updates right after the critics are renewed at the end of pre-training."""
     evaluate_average: float = 0.0
-    """Decay of the running average of the actor's weights that is evaluated and delivered. 0: the actor itself, as in the papers."""
+    """Decay of the running average of the actor's weights that is evaluated and delivered. 0: the actor itself, as in
+    the papers."""
 
 
 @dataclass(frozen=True)
@@ -334,7 +336,8 @@ def check(config: Config) -> Config:
     )
     _require(
         config.steps > until,
-        f"{config.steps} steps end before the first session at step {until}; raise --steps or lower --pretraining.until.",
+        f"{config.steps} steps end before the first session at step {until}; raise --steps or lower "
+        "--pretraining.until.",
     )
     _require(
         random_steps + config.pretraining.neighbours < until,
@@ -346,7 +349,10 @@ def check(config: Config) -> Config:
     )
     if row.explore == "preference_guided":
         every = config.pge.every
-        for name, other in (("K, --session-every", queries.every), ("N, --outer-every", config.bilevel.every)):
+        for name, other in (
+            ("K, --session-every", queries.every),
+            ("N, --outer-every", config.bilevel.every),
+        ):
             if name.startswith("K") or row.outer == "bilevel":
                 _require(
                     other % every == 0,

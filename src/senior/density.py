@@ -22,8 +22,6 @@ def log_density(
     return jax.nn.logsumexp(exponent, axis=-1) - norm
 
 
-def own_log_density(
-    segments: Float[Array, "s H d"], bandwidth: Float[Array, ""] | float
-) -> Float[Array, "s H"]:
+def own_log_density(segments: Float[Array, "s H d"], bandwidth: Float[Array, ""] | float) -> Float[Array, "s H"]:
     """log f_sigma(p_t) of every step of every segment, with the segment's own positions as samples."""
     return jax.vmap(lambda positions: log_density(positions, positions, bandwidth))(segments)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from senior import replay as replay_
 from senior.agent import sac
+from senior.agent.networks import MLP
 from senior.config import Config
 from senior.explore import Bonus, Now, state_entropy
 from senior.replay import Fact, Replay
@@ -76,9 +77,7 @@ def _numbers(config: Config) -> Numbers:
             config.sac.evaluate_average,
         ),
         model.FitNumbers(config.reward.rate, config.reward.epochs, config.reward.stop_accuracy),
-        bilevel.OuterNumbers(
-            config.sac.critic_rate, config.reward.rate, config.bilevel.weight, config.sac.discount
-        ),
+        bilevel.OuterNumbers(config.sac.critic_rate, config.reward.rate, config.bilevel.weight, config.sac.discount),
         until=jnp.int32(config.pretraining.until),
         steps=jnp.int32(config.steps),
         rate_end=jnp.float32(config.sac.rate_end),
@@ -100,9 +99,7 @@ class Learner:
 
     def _init(self, seed: Int[Array, ""]) -> Run:
         config, spec, nets = self.config, self.spec, self.config.networks
-        key_agent, key_model = jax.random.split(
-            jax.random.fold_in(jax.random.key(seed), Purpose.INIT)
-        )
+        key_agent, key_model = jax.random.split(jax.random.fold_in(jax.random.key(seed), Purpose.INIT))
         learns = config.method.learns_reward
         size_in = spec.observation_size + spec.action_size
         return Run(
@@ -116,15 +113,11 @@ class Learner:
                 nets.width,
                 config.sac.initial_alpha,
             ),
-            model=model.init(
-                key_model, config.reward.members, size_in, nets.reward_layers, nets.reward_width
-            )
+            model=model.init(key_model, config.reward.members, size_in, nets.reward_layers, nets.reward_width)
             if learns
             else None,
             replay=replay_.init(config.capacity, spec.observation_size, spec.action_size),
-            entropy=state_entropy.init(
-                config.pretraining.until, spec.observation_size, config.pretraining.neighbours
-            )
+            entropy=state_entropy.init(config.pretraining.until, spec.observation_size, config.pretraining.neighbours)
             if config.pretraining.until
             else None,
             bonus=self.bonus.init(),
@@ -133,15 +126,6 @@ class Learner:
         )
 
     # Every step.
-
-    def act(
-        self, run: Run, observation: Float[Array, " o"], step: Int[Array, ""], random: Bool[Array, ""]
-    ) -> tuple[Run, Float[Array, " a"]]:
-        """An action of the policy, or a uniform one."""
-        key_policy, key_uniform = jax.random.split(_key(run, Purpose.ACT, step))
-        action, _ = sac.sample(run.agent.actor, observation, key_policy)
-        uniform = jax.random.uniform(key_uniform, action.shape, minval=-1, maxval=1)
-        return run, jnp.where(random, uniform, action)
 
     def store(self, run: Run, fact: Fact) -> tuple[Run, Float[Array, ""]]:
         """Store what happened, with its learned reward; returns the episode's learned return so far."""
@@ -190,13 +174,11 @@ class Learner:
         """Every member's sum of rewards of each segment: the logits of Eq. 1."""
         return run, model.rewards(_some(run.model).members, observation, action).sum(axis=-1)
 
-    def fit(
-        self, run: Run, labelled: model.Labelled, step: Int[Array, ""]
-    ) -> tuple[Run, dict[str, Array]]:
+    def fit(self, run: Run, labelled: model.Labelled, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
         """Fit the reward model to all labels and relabel the replay."""
         key = _key(run, Purpose.FIT, step)
         fitted, info = model.fit(_some(run.model), labelled, key, self.config.reward.batch, run.numbers.fit)
-        return self._relabel(run._replace(model=fitted)), info
+        return self.relabel(run._replace(model=fitted))[0], info
 
     def on_session(
         self, run: Run, preferred: Float[Array, "n d"], count: Int[Array, ""], step: Int[Array, ""]
@@ -211,9 +193,7 @@ class Learner:
         bonus = self.bonus.on_refresh(run.bonus, key, run.replay, self._now(run, step))
         return run._replace(bonus=bonus), self.bonus.report(bonus)
 
-    def outer(
-        self, run: Run, pairs: bilevel.FirstSteps, step: Int[Array, ""]
-    ) -> tuple[Run, dict[str, Array]]:
+    def outer(self, run: Run, pairs: bilevel.FirstSteps, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
         """Meta-Reward-Net's outer step on a uniform batch; relabels the replay."""
         key_batch, key_value = jax.random.split(_key(run, Purpose.OUTER, step))
         batch = replay_.sample(run.replay, key_batch, self.config.sac.batch)
@@ -221,7 +201,7 @@ class Learner:
         fitted, info = bilevel.outer_step(
             _some(run.model), run.agent, batch, pairs, key_value, run.numbers.outer, separate
         )
-        return self._relabel(run._replace(model=fitted)), info
+        return self.relabel(run._replace(model=fitted))[0], info
 
     def measure(self, run: Run) -> tuple[Run, Float[Array, ""]]:
         """Take the length scale from the data: ten times the spread of the positions stored so far.
@@ -252,9 +232,7 @@ class Learner:
         curious = jax.tree.map(lambda column: column[rows], run.bonus.curiosity)
         return replay_.mix(batch, curious, run.bonus.ready)
 
-    def _updates(
-        self, run: Run, step: Array, purpose: Purpose, times: int
-    ) -> tuple[Run, dict[str, Array]]:
+    def _updates(self, run: Run, step: Array, purpose: Purpose, times: int) -> tuple[Run, dict[str, Array]]:
         key, now = _key(run, purpose, step), self._now(run, step)
         along = jnp.clip((step - run.numbers.until) / (run.numbers.steps - run.numbers.until), 0, 1)
         rate = 1 + (run.numbers.rate_end - 1) * along
@@ -286,23 +264,45 @@ class Learner:
         all_members = model.rewards(run.model.members, observation, action)
         return all_members.mean(axis=0), all_members.std(axis=0)
 
-    def _relabel(self, run: Run) -> Run:
+    def relabel(self, run: Run) -> tuple[Run, None]:
+        """Score every stored transition anew with the reward model, the bonus's copies included."""
         run = run._replace(replay=replay_.relabel(run.replay, lambda o, a: self._score(run, o, a)))
         if self.config.method.mix != "curiosity":
-            return run
+            return run, None
         held = run.bonus.curiosity
         mean, spread = self._score(run, held.observation, held.action)
-        return run._replace(
-            bonus=run.bonus._replace(curiosity=held._replace(learned_reward=mean, spread=spread))
-        )
+        curiosity = held._replace(learned_reward=mean, spread=spread)
+        return run._replace(bonus=run.bonus._replace(curiosity=curiosity)), None
 
 
-def mean_action(actor: Any, observation: Float[Array, " o"]) -> Float[Array, " a"]:
+class Acting(NamedTuple):
+    """What choosing an action takes of a run."""
+
+    seed: Int[Array, ""]
+    actor: MLP
+
+
+def acting(run: Run) -> Acting:
+    """The part of a run that `act` needs."""
+    return Acting(run.seed, run.agent.actor)
+
+
+def act(
+    part: Acting, observation: Float[Array, " o"], step: Int[Array, ""], random: Bool[Array, ""]
+) -> Float[Array, " a"]:
+    """An action in [-1, 1]: of the policy, or a uniform one."""
+    key_policy, key_uniform = jax.random.split(_key(part, Purpose.ACT, step))
+    action, _ = sac.sample(part.actor, observation, key_policy)
+    uniform = jax.random.uniform(key_uniform, action.shape, minval=-1, maxval=1)
+    return jnp.where(random, uniform, action)
+
+
+def mean_action(actor: MLP, observation: Float[Array, " o"]) -> Float[Array, " a"]:
     """The action that evaluation takes; ``actor`` is ``run.agent.average``."""
     return sac.mean_action(actor, observation)
 
 
-def _key(run: Run, purpose: Purpose, step: Array | int) -> PRNGKeyArray:
+def _key(run: Run | Acting, purpose: Purpose, step: Array | int) -> PRNGKeyArray:
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(run.seed), purpose), step)
 
 

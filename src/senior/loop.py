@@ -19,7 +19,7 @@ import numpy as np
 from senior import health, parts
 from senior.envs.vector import Failure, Step
 from senior.evaluate import EpisodeFailed, judge, summary
-from senior.learner import Purpose, mean_action
+from senior.learner import Purpose, act, acting, mean_action
 from senior.replay import Fact
 from senior.runs import Runs
 from senior.schedule import Due, due
@@ -83,10 +83,12 @@ class Training:
         self.watcher = watcher
         self.clock = Clock(trainees[0].progress.step)
         self.policy = jax.jit(mean_action)
+        self.last = trainees[0].config.steps
+        self.waits = False  # wait for the device after each part, so that its time is that part's (senior bench)
 
     def train(self) -> None:
         """Run from where the runs stand to their end, or until the watcher says stop."""
-        last, learner = self.trainees[0].config.steps, self.trainees[0].learner
+        last = self.last
         start = self.trainees[0].progress.step
         for step in range(start, last + 1):
             stop = self.watcher.stop
@@ -97,8 +99,9 @@ class Training:
 
             plans = [due(trainee.config, step, trainee.progress.queried) for trainee in self.trainees]
             with self.clock.part("act"):
-                actions = self.runs.every(
-                    learner.act,
+                actions = self.runs.look(
+                    acting,
+                    act,
                     self.mask(),
                     [trainee.environment.observations[0] for trainee in self.trainees],
                     [np.int32(step)] * len(plans),
@@ -113,9 +116,17 @@ class Training:
                     self.now_and_then(i, step, plans[i])
             with self.clock.part("update"):
                 info = self.update(step, plans)
+                if self.waits:
+                    self.wait()
             with self.clock.part("store"):
                 self.store(step, plans, happened, info)
+                if self.waits:
+                    self.wait()
             self.watcher.advance(step + 1, self.trainees)
+
+    def wait(self) -> None:
+        """Until the device has done everything asked of it."""
+        self.runs.wait()
 
     def active(self) -> list[int]:
         """Runs that have not failed."""
@@ -341,7 +352,15 @@ def _fact(trainee: Trainee, happened: Step | None) -> Fact:
     if happened is None:
         o, a = trainee.spec.observation_size, trainee.spec.action_size
         zero, no = np.float32(0), np.bool_(False)
-        return Fact(np.zeros(o, np.float32), np.zeros(a, np.float32), zero, np.zeros(o, np.float32), no, no, np.int32(0))  # pyright: ignore[reportArgumentType]
+        return Fact(
+            np.zeros(o, np.float32),
+            np.zeros(a, np.float32),
+            zero,
+            np.zeros(o, np.float32),
+            no,
+            no,
+            np.int32(0),
+        )  # pyright: ignore[reportArgumentType]
     return Fact(
         happened.observation,
         happened.action,

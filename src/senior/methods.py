@@ -74,8 +74,20 @@ METHODS: dict[str, Method] = {
         Method("sac", select="none", explore="none", mix="uniform", outer="none"),
         Method("pebble", select="entropy", explore="none", mix="uniform", outer="none"),
         Method("mrn", select="disagreement", explore="none", mix="uniform", outer="bilevel"),
-        Method("p-senior", select="motion_distinction", explore="preference_guided", mix="curiosity", outer="none"),
-        Method("m-senior", select="motion_distinction", explore="preference_guided", mix="curiosity", outer="bilevel"),
+        Method(
+            "p-senior",
+            select="motion_distinction",
+            explore="preference_guided",
+            mix="curiosity",
+            outer="none",
+        ),
+        Method(
+            "m-senior",
+            select="motion_distinction",
+            explore="preference_guided",
+            mix="curiosity",
+            outer="bilevel",
+        ),
     )
 }
 

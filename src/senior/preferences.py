@@ -58,9 +58,7 @@ class Preferences:
     version is a `ValueError`.
     """
 
-    def __init__(
-        self, path: Path, capacity: int, segment: int, observation_size: int, action_size: int
-    ) -> None:
+    def __init__(self, path: Path, capacity: int, segment: int, observation_size: int, action_size: int) -> None:
         self.arrays = LabelledArrays(
             np.zeros((capacity, 2, segment, observation_size), np.float32),
             np.zeros((capacity, 2, segment, action_size), np.float32),
@@ -134,7 +132,8 @@ class Preferences:
         now = time.time()
         with self._db:
             self._db.executemany(
-                "UPDATE pairs SET answered = 1, label = ?, annotator = ?, answered_at = ?, answered_step = ? WHERE id = ?",
+                "UPDATE pairs SET answered = 1, label = ?, annotator = ?, answered_at = ?, answered_step = ? "
+                "WHERE id = ?",
                 [
                     (label, annotator, now, step, number)
                     for number, label in zip(answers.ids, answers.labels, strict=True)
@@ -153,7 +152,7 @@ class Preferences:
         decided = label != Preferred.EQUAL
         chosen = observation[:count][decided, label[decided]]
         if not decided.any():
-            chosen = observation[:count].reshape(-1, steps, observation.shape[-1])[: capacity]
+            chosen = observation[:count].reshape(-1, steps, observation.shape[-1])[:capacity]
         flat = chosen[..., position].reshape(-1, position.stop - position.start)
         out = np.zeros((capacity * steps, flat.shape[1]), np.float32)
         out[: len(flat)] = flat

@@ -10,13 +10,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from senior.config import (
+    SAC,
     Bilevel,
     Config,
     Evaluation,
     Networks,
     Pretraining,
     Reward,
-    SAC,
     differences,
 )
 from senior.methods import METHODS, Method, method

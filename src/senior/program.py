@@ -66,7 +66,7 @@ def train(
     check(config)
     device = prepare_device(config.device)
     config = replace(config, device=device)
-    learner = _learner(config)
+    learner = make_learner(config)
     trainees = []
     for number in range(seeds):
         own = replace(config, seed=config.seed + number)
@@ -89,7 +89,7 @@ def resume(path: Path | str, watcher: Watcher | None = None) -> list[Result]:
     for directory in find_runs(path):
         config = load(directory / "config.json")
         device = prepare_device(config.device)
-        learner = _learner(config)
+        learner = make_learner(config)
         trainee = Trainee(config, directory, learner)
         _compare_protocol(trainee, device, watcher)
         waiting.append((trainee, trainee.resume(watcher.say)))
@@ -174,7 +174,8 @@ def load_policy(path: Path) -> tuple[int, MLP]:
         saved = unpack(file)
         layers = sum(name.startswith("weight_") for name in saved)
         actor = MLP(
-            tuple(saved[f"weight_{i}"] for i in range(layers)), tuple(saved[f"bias_{i}"] for i in range(layers))
+            tuple(saved[f"weight_{i}"] for i in range(layers)),
+            tuple(saved[f"bias_{i}"] for i in range(layers)),
         )
         return int(saved["step"]), actor
     except (Damaged, KeyError) as error:
@@ -207,7 +208,8 @@ def find_runs(path: Path | str) -> list[Path]:
     return found
 
 
-def _learner(config: Config) -> Learner:
+def make_learner(config: Config) -> Learner:
+    """The functions of a run of that configuration; looks at its environment once."""
     environment, spec = make_environment(config)
     environment.close()
     return Learner(config, spec, parts.bonus(config, spec))

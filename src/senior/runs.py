@@ -35,7 +35,7 @@ class Runs:
         self.size = len(states)
         self.lift = lift
         self._loop = list(states) if lift == "loop" else []
-        self._stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states) if lift == "vmap" else None
+        self._stack = _stack(states) if lift == "vmap" else None
         self.compiled: dict[tuple[str, str], Any] = {}
 
     def __getitem__(self, i: int) -> Run:
@@ -48,6 +48,10 @@ class Runs:
         else:
             self._stack = jax.tree.map(lambda leaf, new: leaf.at[i].set(new), self._stack, state)
 
+    def wait(self) -> None:
+        """Until everything asked of the device is done."""
+        jax.block_until_ready((self._loop, self._stack))
+
     def view(self, i: int, pick: Callable[[Run], Any]) -> Any:
         """A part of the state of run ``i``, without copying the rest. Not to be kept either."""
         if self.lift == "loop":
@@ -59,9 +63,9 @@ class Runs:
 
         Under vmap inactive runs are computed too and their results mean nothing.
         """
-        function = self._compile(of_one, "every")
+        function = self._compile(of_one, "every", donate=True)
         if self.lift == "vmap":
-            stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *column) for column in columns]
+            stacked = [_stack(column) for column in columns]
             self._stack, results = function(self._stack, *stacked)
             return _Stacked(results)
         results: list[Any] = [None] * self.size
@@ -70,16 +74,33 @@ class Runs:
                 self._loop[i], results[i] = function(self._loop[i], *(column[i] for column in columns))
         return results
 
+    def look(
+        self,
+        pick: Callable[[Run], Any],
+        of_part: Callable[..., Any],
+        active: Sequence[bool],
+        *columns: Sequence[Any],
+    ) -> PerRun:
+        """Call a function of a part of the state, which it leaves as it is, for all active runs."""
+        function = self._compile(of_part, "every", donate=False)
+        if self.lift == "vmap":
+            stacked = [_stack(column) for column in columns]
+            return _Stacked(function(pick(self._stack), *stacked))  # pyright: ignore[reportArgumentType]
+        return [
+            function(pick(state), *(column[i] for column in columns)) if active[i] else None
+            for i, state in enumerate(self._loop)
+        ]
+
     def one(self, i: int, of_one: OfOneRun, *arguments: Any) -> Any:
         """Call a function for run ``i`` alone."""
-        function = self._compile(of_one, "one")
+        function = self._compile(of_one, "one", donate=True)
         if self.lift == "vmap":
             self._stack, result = function(self._stack, jnp.int32(i), *arguments)
         else:
             self._loop[i], result = function(self._loop[i], *arguments)
         return result
 
-    def _compile(self, of_one: OfOneRun, use: str) -> Any:
+    def _compile(self, of_one: Callable[..., Any], use: str, donate: bool) -> Any:
         key = (of_one.__name__, use if self.lift == "vmap" else "")
         if key not in self.compiled:
             if self.lift == "loop":
@@ -88,8 +109,12 @@ class Runs:
                 function = jax.vmap(of_one)
             else:
                 function = _at(of_one)
-            self.compiled[key] = jax.jit(function, donate_argnums=0)
+            self.compiled[key] = jax.jit(function, donate_argnums=0 if donate else ())
         return self.compiled[key]
+
+
+def _stack(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
 class _Stacked:
@@ -116,6 +141,7 @@ def prepare_device(wanted: str) -> str:
 
     Raises `BadInput` if a GPU is asked for and there is none.
     """
+    _avoid_hang()
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "senior" / "xla"
     if jax.config.jax_compilation_cache_dir is None:
         jax.config.update("jax_compilation_cache_dir", str(cache))
@@ -127,6 +153,18 @@ def prepare_device(wanted: str) -> str:
     if wanted == "gpu" and found != "gpu":
         raise BadInput("--device gpu: JAX finds no GPU here; install the extra senior-rl[gpu] or use --device cpu.")
     return "gpu" if found == "gpu" else "cpu"
+
+
+def _avoid_hang() -> None:
+    """Split no single operation over XLA's CPU threads; independent operations still run side by side.
+
+    The thread pool that does the splitting can wait for itself for ever (seen here in a fit of the reward
+    ensemble with jaxlib 0.10.2, all threads asleep; CONTRIBUTING.md). XLA reads this when it starts.
+    """
+    flag = "--xla_cpu_multi_thread_eigen"
+    flags = os.environ.get("XLA_FLAGS", "")
+    if flag not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {flag}=false".strip()
 
 
 def lift_for(device: str) -> Lift:

@@ -7,11 +7,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from senior import checkpoint, envs, parts
-from senior.checkpoint import Damaged
 from senior.config import Config
 from senior.envs.vector import TRAINING, Environments, Failure, Step
 from senior.evaluate import DURING_TRAINING
@@ -20,7 +18,7 @@ from senior.preferences import Preferences
 from senior.reward.bilevel import FirstSteps
 from senior.reward.model import Labelled
 from senior.rundir import RunDirectory
-from senior.types import BadInput, EnvSpec, Pairs
+from senior.types import BadInput, EnvSpec
 
 
 @dataclass
@@ -105,19 +103,17 @@ class Trainee:
         failed = self.environment.begin(0, 0)
         if failed:
             raise BadInput(failed.message)
-        self._open_preferences()
+        self._open_preferences(0)
         return self.learner.init(self.config.seed)
 
     def resume(self, tell: Callable[[str], None]) -> Run:
         """The newest checkpoint that can be read, or the beginning if there is none yet."""
-        found = checkpoint.newest(
-            self.directory.checkpoints, lambda: self.learner.init(self.config.seed), tell
-        )
+        found = checkpoint.newest(self.directory.checkpoints, lambda: self.learner.init(self.config.seed), tell)
         if found is None:
             if any(self.directory.checkpoints.glob("step-*.npz")):
                 raise BadInput(f"No checkpoint in {self.directory.path} can be read; the run cannot be resumed.")
             self.directory.forget_everything()
-            self._open_preferences(truncate_to=0)
+            self._open_preferences(0)
             failed = self.environment.begin(0, 0)
             if failed:
                 raise BadInput(failed.message)
@@ -125,15 +121,14 @@ class Trainee:
         step, run, progress = found
         self.progress = Progress(**progress)
         self.directory.truncate(self.progress.lengths, step)
-        self._open_preferences(truncate_to=self.progress.last_pair)
+        self._open_preferences(self.progress.last_pair)
         self._relive(run)
         return run
 
-    def _open_preferences(self, truncate_to: int | None = None) -> None:
-        """Plain SAC asks nothing and has no preference file."""
+    def _open_preferences(self, last: int) -> None:
+        """Open the preference file with pairs up to number ``last``. Plain SAC asks nothing and has none."""
         if self.config.method.learns_reward:
-            if truncate_to is not None:
-                self.preferences.truncate(truncate_to)
+            self.preferences.truncate(last)
 
     def _relive(self, run: Run) -> None:
         """Bring the environment to where the run stands, by the running episode's seed and actions."""
@@ -155,9 +150,7 @@ class Trainee:
         progress.step = step
         progress.lengths = self.directory.lengths()
         progress.last_pair = self.preferences.last if self.config.method.learns_reward else 0
-        progress.written = checkpoint.save(
-            self.directory.checkpoints, step, run, asdict(progress), progress.written
-        )
+        progress.written = checkpoint.save(self.directory.checkpoints, step, run, asdict(progress), progress.written)
         self.directory.save_policy({**policy_arrays(run), "step": np.int64(step)})
 
     def close(self) -> None:

@@ -37,9 +37,7 @@ def fan_in_uniform(key: PRNGKeyArray, size_in: int, size_out: int) -> tuple[Arra
     return draw[:-1], draw[-1]
 
 
-def init_mlp(
-    key: PRNGKeyArray, size_in: int, layers: int, width: int, size_out: int, initialiser: Initialiser
-) -> MLP:
+def init_mlp(key: PRNGKeyArray, size_in: int, layers: int, width: int, size_out: int, initialiser: Initialiser) -> MLP:
     """A perceptron with ``layers`` hidden layers of ``width`` units."""
     sizes = [size_in, *[width] * layers, size_out]
     keys = jax.random.split(key, len(sizes) - 1)

@@ -44,9 +44,7 @@ class Numbers(NamedTuple):
     """Nothing else of SAC is numeric: the target entropy is minus the number of actions."""
 
 
-def init(
-    key: PRNGKeyArray, observation_size: int, action_size: int, layers: int, width: int, alpha: float
-) -> Agent:
+def init(key: PRNGKeyArray, observation_size: int, action_size: int, layers: int, width: int, alpha: float) -> Agent:
     """A new agent; ``alpha`` is the first temperature."""
     key_actor, key_critics = jax.random.split(key)
     actor = init_mlp(key_actor, observation_size, layers, width, 2 * action_size, orthogonal)
@@ -79,9 +77,7 @@ def renew_critics(agent: Agent, key: PRNGKeyArray) -> Agent:
     )
 
 
-def distribution(
-    actor: MLP, observation: Float[Array, "*b o"]
-) -> tuple[Float[Array, "*b a"], Float[Array, "*b a"]]:
+def distribution(actor: MLP, observation: Float[Array, "*b o"]) -> tuple[Float[Array, "*b a"], Float[Array, "*b a"]]:
     """Mean and log standard deviation of the Gaussian before squashing; the latter is kept in its range by a tanh."""
     mean, raw = jnp.split(apply_mlp(actor, observation, jax.nn.relu), 2, axis=-1)
     low, high = LOG_STD_RANGE
@@ -105,9 +101,7 @@ def mean_action(actor: MLP, observation: Float[Array, "*b o"]) -> Float[Array, "
     return jnp.tanh(distribution(actor, observation)[0])
 
 
-def values(
-    critics: MLP, observation: Float[Array, "b o"], action: Float[Array, "b a"]
-) -> Float[Array, "2 b"]:
+def values(critics: MLP, observation: Float[Array, "b o"], action: Float[Array, "b a"]) -> Float[Array, "2 b"]:
     """Q of both critics."""
     x = jnp.concatenate([observation, action], axis=-1)
     return jax.vmap(lambda one: apply_mlp(one, x, jax.nn.relu)[..., 0])(critics)
@@ -135,9 +129,7 @@ def update_critics(
     return agent._replace(critics=critics, critic_adam=state), {"critic_loss": loss, "q": q}
 
 
-def update_actor(
-    agent: Agent, batch: Batch, key: PRNGKeyArray, numbers: Numbers
-) -> tuple[Agent, dict[str, Array]]:
+def update_actor(agent: Agent, batch: Batch, key: PRNGKeyArray, numbers: Numbers) -> tuple[Agent, dict[str, Array]]:
     """One Adam step of the actor on alpha log pi - min_j Q_j, and of its running average."""
 
     def loss_of(actor: MLP) -> tuple[Array, Array]:

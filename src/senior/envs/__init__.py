@@ -20,8 +20,7 @@ def names() -> list[str]:
 def tasks_table() -> list[tuple[str, str, str]]:
     """Rows of ``senior tasks``: name, what is to be done, whether the goal is seen."""
     rows = [
-        (name, task.sentence, "visible" if task.goal_observable else "hidden")
-        for name, task in metaworld.TASKS.items()
+        (name, task.sentence, "visible" if task.goal_observable else "hidden") for name, task in metaworld.TASKS.items()
     ]
     return [*rows, ("point", "Move a point to the goal (a toy, solved in seconds)", "visible")]
 
@@ -54,8 +53,6 @@ def make(
     if task == "point":
         return point.make(horizon or point.HORIZON)
     if horizon is not None and horizon > metaworld.HORIZON:
-        raise BadInput(
-            f"--horizon {horizon} is more than the {metaworld.HORIZON} steps of a Meta-World episode."
-        )
+        raise BadInput(f"--horizon {horizon} is more than the {metaworld.HORIZON} steps of a Meta-World episode.")
     built, spec = metaworld.make(task)
     return built, replace(spec, horizon=horizon or spec.horizon)

@@ -34,8 +34,7 @@ def parse_position(text: str) -> slice:
     match = re.fullmatch(r"\s*(\d+)\s*:\s*(\d+)\s*", text)
     if match is None or int(match[1]) >= int(match[2]):
         raise BadInput(
-            f"--position {text!r} is not a range of observation indices; "
-            "give it as first:end, for instance 0:3."
+            f"--position {text!r} is not a range of observation indices; give it as first:end, for instance 0:3."
         )
     return slice(int(match[1]), int(match[2]))
 
@@ -180,9 +179,7 @@ def _horizon(name: str, env: gymnasium.Env[Any, Any], asked: int | None) -> int:
             limits.append(env._max_episode_steps)
         env = env.env
     if not limits:
-        raise BadInput(
-            f"{name} does not tell how long an episode may last; give --horizon, the most steps of one."
-        )
+        raise BadInput(f"{name} does not tell how long an episode may last; give --horizon, the most steps of one.")
     return min(limits)
 
 

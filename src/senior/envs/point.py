@@ -29,13 +29,9 @@ class Point(gymnasium.Env[np.ndarray, np.ndarray]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012  (Gymnasium's declaration)
     render_mode = "rgb_array"
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
-    observation_space = gymnasium.spaces.Box(
-        np.array([-1, -1, -2, -2], np.float32), np.array([1, 1, 2, 2], np.float32)
-    )
+    observation_space = gymnasium.spaces.Box(np.array([-1, -1, -2, -2], np.float32), np.array([1, 1, 2, 2], np.float32))
 
-    def __init__(
-        self, horizon: int = HORIZON, terminate_at_goal: bool = False, tell_success: bool = True
-    ) -> None:
+    def __init__(self, horizon: int = HORIZON, terminate_at_goal: bool = False, tell_success: bool = True) -> None:
         """``horizon``: steps after which an episode is truncated. ``terminate_at_goal``: the episode really
         ends at success. ``tell_success``: whether ``info`` holds ``success``."""
         self.horizon = horizon
@@ -88,9 +84,7 @@ class Point(gymnasium.Env[np.ndarray, np.ndarray]):
         return frame
 
 
-def make(
-    horizon: int = HORIZON, terminate_at_goal: bool = False, tell_success: bool = True
-) -> tuple[Point, EnvSpec]:
+def make(horizon: int = HORIZON, terminate_at_goal: bool = False, tell_success: bool = True) -> tuple[Point, EnvSpec]:
     """The toy and its `EnvSpec`. The square is 2 wide and stands for Meta-World's metre-wide table, so what
     is one metre there is 2 here."""
     env = Point(horizon, terminate_at_goal, tell_success)

@@ -230,9 +230,7 @@ def draw(request: Request, out: Path) -> None:
             raise  # others may draw without
     except Exception as error:
         raise _does_not_start(error) from error
-    env, _ = make(
-        request.task, request.env, request.position, request.length_scale, request.horizon, render=True
-    )
+    env, _ = make(request.task, request.env, request.position, request.length_scale, request.horizon, render=True)
     fps = int(env.metadata.get("render_fps") or 30)
     stride = max(1, round(fps / MOST_FPS))
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -257,15 +255,11 @@ def main(arguments: list[str]) -> int:
         return NO_VIDEO
     except Exception as error:  # whatever an environment raises: one sentence, as promised
         told = " ".join(str(error).split())
-        print(
-            f"There is no video because the episode failed ({type(error).__name__}: {told}).", file=sys.stderr
-        )
+        print(f"There is no video because the episode failed ({type(error).__name__}: {told}).", file=sys.stderr)
         return NO_VIDEO
     return 0
 
 
 if __name__ == "__main__":
-    sys.unraisablehook = lambda _: (
-        None
-    )  # a half-built renderer, when it is collected, talks after our sentence
+    sys.unraisablehook = lambda _: None  # a half-built renderer, when it is collected, talks after our sentence
     raise SystemExit(main(sys.argv[1:]))

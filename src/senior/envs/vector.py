@@ -27,9 +27,7 @@ class Step(NamedTuple):
     observation: np.ndarray  # float32 [o], before the action
     action: np.ndarray  # float32 [a], in [-1, 1]
     reward: float
-    next_observation: (
-        np.ndarray
-    )  # float32 [o]; at an episode's end its last one, never the next episode's first
+    next_observation: np.ndarray  # float32 [o]; at an episode's end its last one, never the next episode's first
     terminated: bool  # the episode really ended: nothing follows, no bootstrapping
     truncated: bool  # the time limit
     success: float | None  # 0 or 1; None where the environment tells no success

@@ -43,7 +43,11 @@ def learning_curve(run: Path, out: Path | None = None) -> Path:
     if config["method"]["select"] != "none":
         labels = axis.twinx()
         labels.step(
-            evaluations.get("step", []), evaluations.get("labels", []), where="post", color="tab:gray", alpha=0.7
+            evaluations.get("step", []),
+            evaluations.get("labels", []),
+            where="post",
+            color="tab:gray",
+            alpha=0.7,
         )
         labels.set_ylabel("labels", color="tab:gray")
         labels.set_ylim(0, config["queries"]["budget"] * 1.03)

@@ -74,9 +74,7 @@ def outer_step(
 ) -> tuple[RewardModel, dict[str, Array]]:
     """One Adam step of the reward model on the outer loss; ``separate``: with an Adam of its own."""
     next_value = jax.lax.stop_gradient(sac.next_value(agent, batch, key))
-    loss, gradient = jax.value_and_grad(outer_loss)(
-        model.members, agent.critics, batch, next_value, pairs, numbers
-    )
+    loss, gradient = jax.value_and_grad(outer_loss)(model.members, agent.critics, batch, next_value, pairs, numbers)
     state = model.outer_adam if separate else model.adam
     members, state = descend(model.members, gradient, state, numbers.rate)
     model = model._replace(members=members, **{"outer_adam" if separate else "adam": state})

@@ -11,10 +11,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from senior.agent.networks import MLP, adam, apply_mlp, descend, fan_in_uniform, init_mlp
 from senior.types import Preferred
+
+PART = 32
+"""Pairs whose gradient is computed at a time; those of a mini-batch are added up. A fit costs what its labels cost."""
 
 
 class RewardModel(NamedTuple):
@@ -44,15 +47,11 @@ class FitNumbers(NamedTuple):
 
 def init(key: PRNGKeyArray, members: int, size_in: int, layers: int, width: int) -> RewardModel:
     """A new ensemble; every member from its own key."""
-    made = jax.vmap(lambda k: init_mlp(k, size_in, layers, width, 1, fan_in_uniform))(
-        jax.random.split(key, members)
-    )
+    made = jax.vmap(lambda k: init_mlp(k, size_in, layers, width, 1, fan_in_uniform))(jax.random.split(key, members))
     return RewardModel(made, adam.init(made), adam.init(made))  # pyright: ignore[reportArgumentType]
 
 
-def member_reward(
-    member: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"]
-) -> Float[Array, "*b"]:
+def member_reward(member: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"]) -> Float[Array, "*b"]:
     """Reward of one member, in [-1, 1]."""
     x = jnp.concatenate([observation, action], axis=-1)
     return jnp.tanh(apply_mlp(member, x, jax.nn.leaky_relu)[..., 0])
@@ -60,7 +59,7 @@ def member_reward(
 
 def rewards(
     members: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"]
-) -> Float[Array, "members *b"]:
+) -> Float[Array, "members ..."]:
     """Reward of every member."""
     return jax.vmap(member_reward, in_axes=(0, None, None))(members, observation, action)
 
@@ -87,16 +86,20 @@ def fit(
     """
     capacity = labelled.label.shape[0]
     batch = min(batch, capacity)
+    part = min(PART, batch)
     count = labelled.count
     n_members = model.members.weights[0].shape[0]
     target = targets(labelled.label)
+    decided = jnp.sum((labelled.label != Preferred.EQUAL) & (jnp.arange(capacity) < count))
 
-    def loss_of(members: MLP, rows: Int[Array, "members b"], valid: Bool[Array, " b"]) -> tuple[Array, Array]:
+    def loss_of(members: MLP, rows: Int[Array, "m b"], weight: Float[Array, " b"]) -> tuple[Array, Array]:
+        """Summed over members, weighted over pairs; and how many predictions were right."""
+
         def of_member(member: MLP, own: Int[Array, " b"]) -> tuple[Array, Array]:
             logits = member_reward(member, labelled.observation[own], labelled.action[own]).sum(axis=-1)
-            loss = jnp.sum(cross_entropy(logits, target[own]) * valid) / jnp.maximum(valid.sum(), 1)
             right = (logits[:, 1] > logits[:, 0]) == (labelled.label[own] == Preferred.SECOND)
-            return loss, jnp.sum(right & valid & (labelled.label[own] != Preferred.EQUAL))
+            counted = right & (weight > 0) & (labelled.label[own] != Preferred.EQUAL)
+            return jnp.sum(cross_entropy(logits, target[own]) * weight), counted.sum()
 
         losses, right = jax.vmap(of_member)(members, rows)
         return losses.sum(), right.sum()
@@ -105,21 +108,27 @@ def fit(
         model, done, _ = carry
         draw = jax.random.uniform(jax.random.fold_in(key, done), (n_members, capacity))
         order = jnp.argsort(jnp.where(jnp.arange(capacity) < count, draw, jnp.inf), axis=1)
-        order = jnp.pad(order, ((0, 0), (0, -capacity % batch)))
+        order = jnp.pad(order, ((0, 0), (0, batch + part)))
 
         def minibatch(i: Array, carry: tuple[RewardModel, Array]) -> tuple[RewardModel, Array]:
             model, right = carry
-            rows = jax.lax.dynamic_slice_in_dim(order, i * batch, batch, axis=1)
-            valid = i * batch + jnp.arange(batch) < count
-            (_, hits), gradient = jax.value_and_grad(loss_of, has_aux=True)(model.members, rows, valid)
+            size = jnp.minimum(batch, count - i * batch)
+
+            def add(j: Array, carry: tuple[MLP, Array]) -> tuple[MLP, Array]:
+                gradient, right = carry
+                rows = jax.lax.dynamic_slice_in_dim(order, i * batch + j * part, part, axis=1)
+                weight = (j * part + jnp.arange(part) < size) / size
+                (_, hits), more = jax.value_and_grad(loss_of, has_aux=True)(model.members, rows, weight)
+                return jax.tree.map(jnp.add, gradient, more), right + hits
+
+            nothing = jax.tree.map(jnp.zeros_like, model.members)
+            gradient, right = jax.lax.fori_loop(0, (size + part - 1) // part, add, (nothing, right))
             members, state = descend(model.members, gradient, model.adam, numbers.rate)
-            return model._replace(members=members, adam=state), right + hits
+            return model._replace(members=members, adam=state), right
 
         batches = (count + batch - 1) // batch
         model, right = jax.lax.fori_loop(0, batches, minibatch, (model, jnp.zeros((), jnp.int32)))
         return model, done + 1, right / (n_members * jnp.maximum(decided, 1))
-
-    decided = jnp.sum((labelled.label != Preferred.EQUAL) & (jnp.arange(capacity) < count))
 
     def wanted(carry: tuple[RewardModel, Array, Array]) -> Array:
         _, done, accuracy = carry

@@ -1,0 +1,36 @@
+"""A configuration so small that a whole run takes seconds; networks, batch and segments are alike in every test,
+so that what one test compiles serves the others."""
+
+from __future__ import annotations
+
+import csv
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from senior.config import SAC, Config, Evaluation, Networks, Pretraining, PreferenceGuided, Queries, Reward
+from senior.config import Bilevel
+from senior.presets import preset
+
+NETWORKS = Networks(layers=1, width=32, reward_layers=1, reward_width=32)
+
+
+def small(method: str = "m-senior", task: str = "point", **changes: Any) -> Config:
+    config = preset("paper", task, method)
+    learns = config.method.learns_reward
+    config = replace(
+        config,
+        steps=2000,
+        networks=NETWORKS,
+        sac=SAC(batch=64, actor_rate=3e-3, critic_rate=3e-3, alpha_rate=3e-3, tau=0.02, discount=0.9, reset_updates=20),
+        pretraining=Pretraining(random_steps=100, until=400 if learns else 0),
+        queries=Queries(budget=35, per_session=10, every=200, segment=10, episodes=20, pool=10),
+        reward=Reward(epochs=50, rate=3e-3, batch=16),
+        pge=PreferenceGuided(capacity=100, every=100),
+        bilevel=Bilevel(every=200),
+        evaluation=Evaluation(every=500, episodes=5),
+        checkpoint_every=500,
+        snapshot_every=1000,
+    )
+    return replace(config, **changes)
