@@ -9,8 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from senior.config import SAC, Config, Evaluation, Networks, Pretraining, PreferenceGuided, Queries, Reward
-from senior.config import Bilevel
+from senior.config import SAC, Bilevel, Config, Evaluation, Networks, Pretraining, PreferenceGuided, Queries, Reward
 from senior.presets import preset
 
 NETWORKS = Networks(layers=1, width=32, reward_layers=1, reward_width=32)
@@ -34,3 +33,18 @@ def small(method: str = "m-senior", task: str = "point", **changes: Any) -> Conf
         snapshot_every=1000,
     )
     return replace(config, **changes)
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file."""
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def preferences_dump(run: Path) -> list[tuple[Any, ...]]:
+    """All that was asked and answered, without the time of day."""
+    with sqlite3.connect(run / "preferences.sqlite") as db:
+        names = [row[1] for row in db.execute("PRAGMA table_info(pairs)") if row[1] != "answered_at"]
+        found = db.execute(f"SELECT {', '.join(names)} FROM pairs ORDER BY id").fetchall()
+    db.close()
+    return found
