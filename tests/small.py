@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from senior.config import SAC, Bilevel, Config, Evaluation, Networks, Pretraining, PreferenceGuided, Queries, Reward
+from senior.config import SAC, Bilevel, Config, Evaluation, Networks, PreferenceGuided, Pretraining, Queries, Reward
 from senior.presets import preset
 
 NETWORKS = Networks(layers=1, width=32, reward_layers=1, reward_width=32)

@@ -177,9 +177,7 @@ def test_the_outer_gradient_is_that_of_differences_through_the_inner_step(
 def test_the_learned_reward_moves_so_that_the_outer_loss_falls(agent: sac.Agent, reward_model: RewardModel):
     batch, pairs, losses = batch_of(), pairs_of([FIRST, SECOND, SECOND, FIRST]), []
     for _ in range(30):
-        reward_model, info = outer_step(
-            reward_model, agent, batch, pairs, KEY, NUMBERS._replace(rate=1e-2), True
-        )
+        reward_model, info = outer_step(reward_model, agent, batch, pairs, KEY, NUMBERS._replace(rate=1e-2), True)
         losses.append(float(info["outer_loss"]))
     assert losses[-1] < losses[0] and np.all(np.diff(losses) < 1e-6)
 
@@ -249,9 +247,7 @@ def test_the_shared_adam_carries_the_fits_momentum_into_the_outer_step_and_a_sep
     agent: sac.Agent, reward_model: RewardModel
 ):
     """With no pair at all the gradient is nothing, so whatever still moves is left-over momentum."""
-    warm = reward_model._replace(
-        adam=reward_model.adam._replace(mu=jax.tree.map(jnp.ones_like, reward_model.adam.mu))
-    )
+    warm = reward_model._replace(adam=reward_model.adam._replace(mu=jax.tree.map(jnp.ones_like, reward_model.adam.mu)))
     pairs = pairs_of([FIRST], [0.0])
     shared, _ = outer_step(warm, agent, batch_of(), pairs, KEY, NUMBERS, False)
     separate, _ = outer_step(warm, agent, batch_of(), pairs, KEY, NUMBERS, True)

@@ -355,9 +355,7 @@ def taken(step: Step | Failure) -> Step:
 
 def same(first: list[Step], second: list[Step]) -> bool:
     return len(first) == len(second) and all(
-        np.array_equal(a, b)
-        for one, other in zip(first, second, strict=True)
-        for a, b in zip(one, other, strict=True)
+        np.array_equal(a, b) for one, other in zip(first, second, strict=True) for a, b in zip(one, other, strict=True)
     )
 
 
@@ -397,9 +395,7 @@ def test_meta_world_is_stepped_with_float32_actions():
     together.close()
     observations, rewards, successes = lived(ours("door-lock"), episode_seed(2, EVALUATION, 0), actions)
     np.testing.assert_array_equal([step.observation for step in steps], observations[:-1].astype(np.float32))
-    np.testing.assert_array_equal(
-        [step.next_observation for step in steps], observations[1:].astype(np.float32)
-    )
+    np.testing.assert_array_equal([step.next_observation for step in steps], observations[1:].astype(np.float32))
     assert [step.reward for step in steps] == rewards
     assert [step.success for step in steps] == successes
 

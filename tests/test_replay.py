@@ -207,9 +207,7 @@ def test_a_candidate_lies_inside_one_episode_and_ends_before_its_last_step(tmp_p
     assert candidates is not None
     rows, episode, start = candidates
     inside = rows[..., None] + np.arange(SEGMENT)
-    assert np.array_equal(
-        np.asarray(held.facts.episode)[inside], np.repeat(episode[..., None], SEGMENT, axis=-1)
-    )
+    assert np.array_equal(np.asarray(held.facts.episode)[inside], np.repeat(episode[..., None], SEGMENT, axis=-1))
     assert not np.asarray(held.facts.truncated)[inside].any()
     steps = np.asarray(replay.segments(held, rows, SEGMENT)[0])[..., 0]
     assert np.array_equal(steps, start[..., None] + np.arange(SEGMENT))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +24,16 @@ Arrays = list[np.ndarray]
 
 
 @cache
-def fit(batch: int = BATCH) -> Callable[..., tuple[RewardModel, dict[str, jax.Array]]]:
-    return jax.jit(lambda m, labelled, key, numbers: model.fit(m, labelled, key, batch, numbers))
+def fit(batch: int = BATCH, part: int = model.PART) -> Callable[..., tuple[RewardModel, dict[str, jax.Array]]]:
+    """A compiled fit in mini-batches of ``batch`` pairs whose gradient is added up ``part`` pairs at a time."""
+
+    def traced(*arguments: Any) -> tuple[RewardModel, dict[str, jax.Array]]:
+        before, labelled, key, numbers = arguments
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(model, "PART", part)
+            return model.fit(before, labelled, key, batch, numbers)
+
+    return jax.jit(traced)
 
 
 def model_of(seed: int = 0, members: int = 3, width: int = 5) -> RewardModel:
@@ -154,10 +163,11 @@ def test_cross_entropy_stays_finite_for_logits_far_apart():
 
 
 @pytest.mark.parametrize("labels", [[FIRST], [SECOND], [EQUAL], mixed(7)], ids=str)
-def test_a_step_follows_the_gradient_of_bradley_terry_on_summed_rewards(labels: list[int]):
+@pytest.mark.parametrize("part", [32, 3])
+def test_a_step_follows_the_gradient_of_bradley_terry_on_summed_rewards(labels: list[int], part: int):
     """The gradient is read from Adam's first moment: means in place of sums, or over rows that hold no label, differ."""
     before, labelled = model_of(4), labelled_of(labels, garbage=3.0)
-    after, _ = fit()(before, labelled, jax.random.key(0), ONE_EPOCH)
+    after, _ = fit(part=part)(before, labelled, jax.random.key(0), ONE_EPOCH)
     gradient = numeric_gradient(lambda members: loss_by_hand(members, labelled), flat(before.members))
     for old, new, moment, g in zip(
         flat(before.members), flat(after.members), flat(after.adam.mu), gradient, strict=True
@@ -169,10 +179,11 @@ def test_a_step_follows_the_gradient_of_bradley_terry_on_summed_rewards(labels: 
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9])
-def test_rows_that_hold_no_label_have_no_influence_whatever_they_hold(count: int):
+@pytest.mark.parametrize("part", [32, 3])
+def test_rows_that_hold_no_label_have_no_influence_whatever_they_hold(count: int, part: int):
     numbers = ONE_EPOCH._replace(epochs=3, stop_accuracy=1.0)
     clean, dirty = (
-        fit()(model_of(5), labelled_of(mixed(count), garbage=g), jax.random.key(1), numbers)
+        fit(part=part)(model_of(5), labelled_of(mixed(count), garbage=g), jax.random.key(1), numbers)
         for g in (0.0, 1e3)
     )
     assert_same(clean, dirty)
@@ -215,10 +226,11 @@ def test_an_epoch_takes_one_step_per_begun_mini_batch(count: int, epochs: int):
     assert int(again.adam.count) == 2 * int(after.adam.count)  # the moments live on from session to session
 
 
-def test_every_label_is_seen_once_an_epoch():
-    """With a rate of nothing, the moments after two mini-batches are those of the two partial gradients."""
+@pytest.mark.parametrize("part", [32, 3])
+def test_every_label_is_seen_once_an_epoch(part: int):
+    """At a rate of nothing Adam's first moment is a weighted sum of the mini-batches' gradients."""
     before, labelled = model_of(9, members=1), labelled_of(mixed(12))
-    after, _ = fit(4)(before, labelled, jax.random.key(7), ONE_EPOCH._replace(rate=0.0))
+    after, _ = fit(4, part)(before, labelled, jax.random.key(7), ONE_EPOCH._replace(rate=0.0))
     gradients = [  # of every single label
         numeric_gradient(
             lambda members, i=i: loss_by_hand(
@@ -246,9 +258,10 @@ def accuracy_by_hand(members: Arrays, labelled: Labelled) -> float:
 
 
 @pytest.mark.parametrize("labels", [mixed(8), [FIRST, EQUAL, EQUAL], [SECOND] * 5], ids=str)
-def test_accuracy_is_measured_before_the_step_and_leaves_equal_pairs_out(labels: list[int]):
+@pytest.mark.parametrize("part", [32, 3])
+def test_accuracy_is_measured_before_the_step_and_leaves_equal_pairs_out(labels: list[int], part: int):
     before, labelled = model_of(10), labelled_of(labels, garbage=5.0)
-    _, info = fit()(before, labelled, jax.random.key(8), ONE_EPOCH)
+    _, info = fit(part=part)(before, labelled, jax.random.key(8), ONE_EPOCH)
     np.testing.assert_allclose(info["fit_accuracy"], accuracy_by_hand(flat(before.members), labelled), rtol=1e-6)
 
 
@@ -288,16 +301,17 @@ def test_a_fit_depends_on_its_key_and_on_nothing_else():
 
 
 def test_a_linear_preference_is_learned_and_foretold_for_new_pairs():
-    rng, w = np.random.default_rng(14), np.array([1.0, -2.0, 0.5])
-    n = 384
+    rng, train, n = np.random.default_rng(14), 400, 800
     observation = rng.normal(size=(n, 2, H, O)).astype(np.float32)
     action = rng.uniform(-1, 1, (n, 2, H, A)).astype(np.float32)
-    score = (observation @ w).sum(axis=-1) + 0.5 * action[..., 0].sum(axis=-1)
+    score = (observation @ np.array([1.0, -2.0, 0.5]) + 0.5 * action[..., 0]).sum(axis=-1)
     label = (score[:, 1] > score[:, 0]).astype(np.int32)
-    train = 256
     labelled = Labelled(observation[:train], action[:train], label[:train], np.int32(train))  # pyright: ignore
-    numbers = FitNumbers(rate=3e-3, epochs=300, stop_accuracy=0.97)
-    fitted, info = fit(64)(model_of(15, width=16), labelled, jax.random.key(11), numbers)
+    # Small weights: where the tanh does not bend, a linear reward is the simplest one.
+    begin = model_of(15, width=8)
+    begin = begin._replace(members=jax.tree.map(lambda x: 0.5 * x, begin.members))
+    numbers = FitNumbers(rate=3e-3, epochs=60, stop_accuracy=0.97)
+    fitted, info = fit(64)(begin, labelled, jax.random.key(11), numbers)
     summed = model.rewards(fitted.members, observation[train:], action[train:]).mean(axis=0).sum(axis=-1)
     foretold = (np.asarray(summed[:, 1] > summed[:, 0]) == label[train:]).mean()
-    assert info["fit_accuracy"] > 0.97 and foretold > 0.8, "chance is 0.5"
+    assert foretold > 0.9, (foretold, info)

@@ -14,9 +14,7 @@ from senior.agent.networks import MLP
 from senior.types import Batch, Source
 
 O, A, B = 3, 2, 6
-NUMBERS = sac.Numbers(
-    actor_rate=1e-3, critic_rate=2e-3, alpha_rate=5e-3, discount=0.9, tau=0.25, average=0.0
-)
+NUMBERS = sac.Numbers(actor_rate=1e-3, critic_rate=2e-3, alpha_rate=5e-3, discount=0.9, tau=0.25, average=0.0)
 Arrays = list[np.ndarray]
 
 
@@ -107,9 +105,7 @@ def adam_direction(gradient: np.ndarray) -> np.ndarray:
     return gradient / (np.abs(gradient) + 1e-8)
 
 
-def assert_first_adam_step(
-    before: MLP, after: MLP, moments: MLP, gradient: Arrays, rate: float
-) -> None:
+def assert_first_adam_step(before: MLP, after: MLP, moments: MLP, gradient: Arrays, rate: float) -> None:
     """The gradient is in Adam's first moment, and the parameters moved by the rate against its sign."""
     for old, new, moment, g in zip(flat(before), flat(after), flat(moments), gradient, strict=True):
         np.testing.assert_allclose(moment / 0.1, g, rtol=2e-4, atol=2e-5)
@@ -142,7 +138,9 @@ def test_log_probability_is_finite_where_the_squash_saturates():
     assert np.isfinite(log_prob) and np.abs(action).max() <= 1
 
 
-@pytest.mark.parametrize(("raw", "expected"), [(-100.0, -5.0), (0.0, -1.5), (100.0, 2.0), (0.5, -1.5 + 3.5 * np.tanh(0.5))])
+@pytest.mark.parametrize(
+    ("raw", "expected"), [(-100.0, -5.0), (0.0, -1.5), (100.0, 2.0), (0.5, -1.5 + 3.5 * np.tanh(0.5))]
+)
 def test_log_std_is_kept_in_its_bounds_by_a_tanh(raw: float, expected: float):
     actor = sac.init(jax.random.key(0), O, A, 1, 4, 0.1).actor
     actor = actor._replace(biases=(actor.biases[0], jnp.array([0.0, 0.0, raw, raw])))

@@ -19,7 +19,11 @@ def log_density(
     distance = jnp.sum((points[:, None, :] - samples[None, :, :]) ** 2, axis=-1)
     exponent = -0.5 * distance / bandwidth**2
     norm = jnp.log(samples.shape[0]) + d * (jnp.log(bandwidth) + 0.5 * jnp.log(2 * jnp.pi))
-    return jax.nn.logsumexp(exponent, axis=-1) - norm
+    # At least one term is 1. XLA may compute the exponent twice and round it differently, which far from all samples
+    # leaves 0 or infinity instead; hence no ready-made logsumexp.
+    largest = exponent.max(axis=-1, keepdims=True)
+    total = jnp.exp(jnp.minimum(exponent - largest, 0)).sum(axis=-1)
+    return largest[..., 0] + jnp.log(jnp.maximum(total, 1)) - norm
 
 
 def own_log_density(segments: Float[Array, "s H d"], bandwidth: Float[Array, ""] | float) -> Float[Array, "s H"]:
