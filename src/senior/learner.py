@@ -92,10 +92,11 @@ class Learner:
         self.config = config
         self.spec = spec
         self.bonus = bonus
+        self._compiled_init = jax.jit(self._init)
 
     def init(self, seed: int) -> Run:
         """The state before the first step."""
-        return jax.jit(self._init)(np.uint32(seed))
+        return self._compiled_init(np.uint32(seed))
 
     def _init(self, seed: Int[Array, ""]) -> Run:
         config, spec, nets = self.config, self.spec, self.config.networks

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import jax
@@ -20,7 +21,7 @@ from senior.loop import Training, Watcher
 from senior.report.curves import learning_curve
 from senior.runs import Lift, Runs, lift_for, prepare_device
 from senior.trainee import Trainee, make_environment
-from senior.types import BadInput
+from senior.types import BadInput, EnvSpec
 
 
 class Quiet:
@@ -212,6 +213,12 @@ def make_learner(config: Config) -> Learner:
     """The functions of a run of that configuration; looks at its environment once."""
     environment, spec = make_environment(config)
     environment.close()
+    return _learner(replace(config, seed=0), spec)
+
+
+@lru_cache(maxsize=16)
+def _learner(config: Config, spec: EnvSpec) -> Learner:
+    """One learner for equal configurations, so that what one run compiled serves the next."""
     return Learner(config, spec, parts.bonus(config, spec))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -36,7 +37,6 @@ class Runs:
         self.lift = lift
         self._loop = list(states) if lift == "loop" else []
         self._stack = _stack(states) if lift == "vmap" else None
-        self.compiled: dict[tuple[str, str], Any] = {}
 
     def __getitem__(self, i: int) -> Run:
         """The state of run ``i``. Do not keep it across a call: its arrays are given away."""
@@ -63,7 +63,7 @@ class Runs:
 
         Under vmap inactive runs are computed too and their results mean nothing.
         """
-        function = self._compile(of_one, "every", donate=True)
+        function = compiled(of_one, self.lift, "every", donate=True)
         if self.lift == "vmap":
             stacked = [_stack(column) for column in columns]
             self._stack, results = function(self._stack, *stacked)
@@ -82,7 +82,7 @@ class Runs:
         *columns: Sequence[Any],
     ) -> PerRun:
         """Call a function of a part of the state, which it leaves as it is, for all active runs."""
-        function = self._compile(of_part, "every", donate=False)
+        function = compiled(of_part, self.lift, "every", donate=False)
         if self.lift == "vmap":
             stacked = [_stack(column) for column in columns]
             return _Stacked(function(pick(self._stack), *stacked))  # pyright: ignore[reportArgumentType]
@@ -93,24 +93,22 @@ class Runs:
 
     def one(self, i: int, of_one: OfOneRun, *arguments: Any) -> Any:
         """Call a function for run ``i`` alone."""
-        function = self._compile(of_one, "one", donate=True)
+        function = compiled(of_one, self.lift, "one", donate=True)
         if self.lift == "vmap":
             self._stack, result = function(self._stack, jnp.int32(i), *arguments)
         else:
             self._loop[i], result = function(self._loop[i], *arguments)
         return result
 
-    def _compile(self, of_one: Callable[..., Any], use: str, donate: bool) -> Any:
-        key = (of_one.__name__, use if self.lift == "vmap" else "")
-        if key not in self.compiled:
-            if self.lift == "loop":
-                function = of_one
-            elif use == "every":
-                function = jax.vmap(of_one)
-            else:
-                function = _at(of_one)
-            self.compiled[key] = jax.jit(function, donate_argnums=0 if donate else ())
-        return self.compiled[key]
+
+@lru_cache(maxsize=256)
+def compiled(of_one: Callable[..., Any], lift: Lift, use: Literal["every", "one"], donate: bool) -> Any:
+    """A function of one run, lifted and compiled. The same function is the same program for all that use it."""
+    if lift == "loop":
+        function = of_one
+    else:
+        function = jax.vmap(of_one) if use == "every" else _at(of_one)
+    return jax.jit(function, donate_argnums=0 if donate else ())
 
 
 def _stack(trees: Sequence[Any]) -> Any:

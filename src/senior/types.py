@@ -38,7 +38,7 @@ class EnvSpec:
     name: str
     observation_size: int
     action_size: int
-    position: slice
+    position: slice = field(hash=False)  # no hash before Python 3.12
     horizon: int
     """The most steps of an episode; reaching it is a truncation, never a termination."""
     length_scale: float | None
