@@ -303,7 +303,7 @@ def parse(
 ) -> Options:
     """Options of a command by tyro, with its complaints made one sentence."""
     complaint = io.StringIO()
-    extra = {} if default is None else {"default": default}
+    extra: dict[str, Any] = {} if default is None else {"default": default}
     try:
         with contextlib.redirect_stderr(complaint):
             options, unknown = tyro.cli(

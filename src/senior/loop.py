@@ -215,8 +215,8 @@ class Training:
             )
             return
         starts, episodes, first_steps = drawn
-        cut = (np.asarray(column) for column in runs.one(i, learner.cut, starts))
-        pool = Pairs(*cut, episodes, first_steps)
+        observation, action, reward = (np.asarray(column) for column in runs.one(i, learner.cut, starts))
+        pool = Pairs(observation, action, reward, episodes, first_steps)
         length_scale = float(runs.view(i, lambda run: run.length_scale))
         variance = pool.observation[..., trainee.spec.position].var(axis=-2).max()
         self.warn(i, "motion", health.nothing_moves(float(variance), length_scale))
@@ -351,17 +351,9 @@ def _fact(trainee: Trainee, happened: Step | None) -> Fact:
     """A transition for the device; of a stopped run, anything of the right shape."""
     if happened is None:
         o, a = trainee.spec.observation_size, trainee.spec.action_size
-        zero, no = np.float32(0), np.bool_(False)
-        return Fact(
-            np.zeros(o, np.float32),
-            np.zeros(a, np.float32),
-            zero,
-            np.zeros(o, np.float32),
-            no,
-            no,
-            np.int32(0),
-        )  # pyright: ignore[reportArgumentType]
-    return Fact(
+        nothing = np.zeros(o, np.float32)
+        happened = Step(nothing, np.zeros(a, np.float32), 0.0, nothing, False, False, None)
+    values: list[Any] = [
         happened.observation,
         happened.action,
         np.float32(happened.reward),
@@ -369,4 +361,5 @@ def _fact(trainee: Trainee, happened: Step | None) -> Fact:
         np.bool_(happened.terminated),
         np.bool_(happened.truncated),
         np.int32(trainee.progress.episode),
-    )  # pyright: ignore[reportArgumentType]
+    ]
+    return Fact(*values)

@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from senior import evaluate, parts, rundir
@@ -175,8 +176,8 @@ def load_policy(path: Path) -> tuple[int, MLP]:
         saved = unpack(file)
         layers = sum(name.startswith("weight_") for name in saved)
         actor = MLP(
-            tuple(saved[f"weight_{i}"] for i in range(layers)),
-            tuple(saved[f"bias_{i}"] for i in range(layers)),
+            tuple(jnp.asarray(saved[f"weight_{i}"]) for i in range(layers)),
+            tuple(jnp.asarray(saved[f"bias_{i}"]) for i in range(layers)),
         )
         return int(saved["step"]), actor
     except (Damaged, KeyError) as error:

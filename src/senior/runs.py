@@ -26,7 +26,7 @@ OfOneRun = Callable[..., tuple[Run, Any]]
 class PerRun(Protocol):
     """Results of all runs; those of run ``i`` are ``results[i]``."""
 
-    def __getitem__(self, i: int) -> Any: ...
+    def __getitem__(self, i: int, /) -> Any: ...
 
 
 class Runs:
@@ -141,7 +141,7 @@ def prepare_device(wanted: str) -> str:
     """
     _avoid_hang()
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "senior" / "xla"
-    if jax.config.jax_compilation_cache_dir is None:
+    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
         jax.config.update("jax_compilation_cache_dir", str(cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     if wanted == "cpu":

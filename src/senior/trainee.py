@@ -151,7 +151,7 @@ class Trainee:
         progress.lengths = self.directory.lengths()
         progress.last_pair = self.preferences.last if self.config.method.learns_reward else 0
         progress.written = checkpoint.save(self.directory.checkpoints, step, run, asdict(progress), progress.written)
-        self.directory.save_policy({**policy_arrays(run), "step": np.int64(step)})
+        self.directory.save_policy({**policy_arrays(run), "step": np.asarray(step)})
 
     def close(self) -> None:
         """Close environments and files."""

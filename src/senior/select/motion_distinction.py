@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 
 from senior.density import own_log_density
@@ -22,7 +23,7 @@ STILL = 1e-12
 def motion_sum(positions: np.ndarray, bandwidth: float, of: str = "density") -> np.ndarray:
     """1/m of Eq. 3 for pairs ``positions [P, 2, H, d]`` -> ``[P]``; ``of="log"`` sums log densities instead."""
     pairs, _, steps, d = positions.shape
-    log_f = np.asarray(own_log_density(positions.reshape(-1, steps, d), bandwidth), np.float64)
+    log_f = np.asarray(own_log_density(jnp.asarray(positions.reshape(-1, steps, d)), bandwidth), np.float64)
     return (log_f if of == "log" else np.exp(log_f)).reshape(pairs, -1).sum(axis=1)
 
 
