@@ -55,11 +55,18 @@ def pack(arrays: dict[str, np.ndarray], compress: bool = False) -> bytes:
 
 
 def unpack(path: Path) -> dict[str, np.ndarray]:
-    """Read an ``.npz`` file whole, checksums included; `Damaged` if that fails."""
+    """Read an ``.npz`` file whole, checksums included; `Damaged` if that fails.
+
+    A member's checksum is verified before its bytes are parsed. Damage makes the decompressor and the parser fail
+    in more ways than can be listed, so any failure counts.
+    """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError, KeyError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
+        with zipfile.ZipFile(path) as file:
+            members = {name.removesuffix(".npy"): file.read(name) for name in file.namelist()}
+        return {
+            name: np.lib.format.read_array(io.BytesIO(member), allow_pickle=False) for name, member in members.items()
+        }
+    except Exception as error:
         raise Damaged(f"{path.name} is damaged ({error})") from error
 
 
@@ -128,7 +135,8 @@ def newest(
 ) -> tuple[int, Run, dict[str, Any]] | None:
     """The newest checkpoint that can be read as (step, run, progress); None if there is none at all.
 
-    A damaged one is named through ``tell``, and the one before is tried.
+    A damaged one is named through ``tell``, and the one before is tried. What is newer than the one that is read
+    is deleted: it will be written again, and must not count among those that are kept.
     """
     for leftover in directory.glob("*.tmp"):
         leftover.unlink()
@@ -138,6 +146,9 @@ def newest(
         except Damaged as error:
             tell(f"Checkpoint {error}; trying the one before.")
             continue
+        for newer in steps(directory):
+            if newer > step:
+                (directory / f"step-{newer:010d}.npz").unlink()
         for path in directory.glob("facts-*.npz"):
             match = _CHUNK.fullmatch(path.name)
             if match and int(match[2]) > int(run.replay.count):

@@ -170,7 +170,7 @@ def _train(arguments: list[str]) -> int:
     out = options.out or Path("runs") / f"{name}-{config.method.name}-{config.preset}"
     display = Display()
     try:
-        results = program.train(config, out, options.seeds or 1, display)
+        results = program.train(config, out, 1 if options.seeds is None else options.seeds, display)
     finally:
         display.close()
     return _report(results, display)
@@ -336,17 +336,19 @@ def _unknown_option(kind: type[Any], option: str, default: Any, command: str) ->
 
 
 def _one_sentence(box: str) -> str:
-    """The text inside tyro's box, without its frame, hints and line breaks."""
-    box = re.split(r"Argument helptext|─{10,}\s*Argument", box)[0]
-    lines = [re.sub(r"[│╭╮╰╯─┌┐└┘]|\x1b\[[0-9;]*m", " ", line).strip() for line in box.splitlines()]
-    kept: list[str] = []
-    for line in lines:
-        if line.lower().startswith(("for full helptext", "parsing error")) or not line:
-            continue
-        kept.append(line)
-    sentence = " ".join(" ".join(kept).split())
-    sentence = re.sub(r"^(Value error|Missing argument|Required options|Invalid choice)\s+(?=[A-Z])", "", sentence)
-    return sentence if sentence.endswith((".", "!", "?")) else sentence + "."
+    """What tyro complains of, in our words; where they are not known, its own without their frame."""
+    lines = [re.sub(r"[│╭╮╰╯─┌┐└┘|]|-{3,}|\x1b\[[0-9;]*m", " ", line) for line in box.splitlines()]
+    text = " ".join(" ".join(lines).split())
+    if found := re.search(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*?)\)", text):
+        return str(BadInput.unknown(found[2], found[1], re.findall(r"'([^']*)'", found[3])))
+    if found := re.search(r"Missing value for argument '(\S+)'", text):
+        return f"{found[1]} needs a value."
+    if found := re.search(r"Missing from (senior \w+): (\S+)", text):
+        return f"{found[1]} needs a {found[2]}; see {found[1]} --help."
+    if found := re.search(r"Error parsing (\S+):.*(literal for int|to float).*?: ('.*?')", text):
+        kind = "a whole number" if found[2] == "literal for int" else "a number"
+        return f"{found[1]} needs {kind}, not {found[3]}."
+    return text.split("Argument helptext")[0].split("For full helptext")[0].strip()
 
 
 if __name__ == "__main__":

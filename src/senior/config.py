@@ -222,7 +222,7 @@ class Config:
     @property
     def capacity(self) -> int:
         """Rows of the replay buffer."""
-        return self.replay_capacity or self.steps
+        return self.steps if self.replay_capacity is None else self.replay_capacity
 
 
 def to_json(config: Config) -> dict[str, Any]:
@@ -246,7 +246,7 @@ def load(path: Path) -> Config:
         return from_json(json.loads(path.read_text())["config"])
     except FileNotFoundError:
         raise BadInput(f"{path.parent} is not a run directory: it holds no config.json.") from None
-    except (json.JSONDecodeError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise BadInput(f"{path} is damaged: {error}.") from error
 
 
@@ -277,7 +277,6 @@ def check(config: Config) -> Config:
         ("--refresh-every", config.pge.every),
         ("--outer-every", config.bilevel.every),
         ("--segment", queries.segment),
-        ("--candidate-episodes", queries.episodes),
         ("--pool", queries.pool),
         ("--sac.batch", config.sac.batch),
         ("--sac.updates", config.sac.updates),
@@ -295,9 +294,21 @@ def check(config: Config) -> Config:
         ("--snapshot-every", config.snapshot_every),
         ("--pretraining.neighbours", config.pretraining.neighbours),
         ("--pge.capacity", config.pge.capacity),
-        ("--replay-capacity", config.capacity),
+        ("--replay-capacity", 1 if config.replay_capacity is None else config.replay_capacity),
     ):
         _require(value >= 1, f"{name} must be at least 1, not {value}.")
+    for name, value in (
+        ("--seed", config.seed),
+        ("--sac.reset-updates", config.sac.reset_updates),
+        ("--pretraining.random-steps", config.pretraining.random_steps),
+        ("--pge.beta", config.pge.beta),
+        ("--bilevel.weight", config.bilevel.weight),
+    ):
+        _require(0 <= value < float("inf"), f"{name} must be 0 or more, not {value}.")
+    _require(config.seed < 2**32, f"--seed must be below {2**32}, not {config.seed}.")
+    _require(
+        queries.episodes >= 2, f"--candidate-episodes must be at least 2, as pairs need, not {queries.episodes}."
+    )
     for name, number in (
         ("--bandwidth-mds", config.mds.bandwidth),
         ("--bandwidth-pge", config.pge.bandwidth),
@@ -317,9 +328,9 @@ def check(config: Config) -> Config:
         ("--sac.discount", config.sac.discount),
         ("--sac.rate-end", config.sac.rate_end),
         ("--sac.evaluate-average", config.sac.evaluate_average),
+        ("--reward.stop-accuracy", config.reward.stop_accuracy),
     ):
         _require(0 <= share <= 1, f"{name} must lie between 0 and 1, not {share}.")
-    _require(config.seed >= 0, f"--seed must be 0 or more, not {config.seed}.")
     _require(
         config.precision == "float32",
         "--precision bfloat16 is not offered yet: its learning curves have not been compared with float32's.",

@@ -24,11 +24,15 @@ def load(name: str, known: dict[str, str], kind: str) -> Any:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     try:
-        return getattr(importlib.import_module(module), attribute)
-    except ImportError as error:
-        raise BadInput(f"The {kind} {name!r} cannot be imported: {error}.") from error
-    except AttributeError:
-        raise BadInput(f"The {kind} {name!r} does not exist: {module} holds no {attribute}.") from None
+        holder = importlib.import_module(module)
+    except Exception as error:  # whatever the user's module raises
+        raise BadInput(f"The {kind} {name!r} cannot be imported: {' '.join(str(error).split())}.") from error
+    found = getattr(holder, attribute, None)
+    if found is None:
+        raise BadInput(f"The {kind} {name!r} does not exist: {module} holds no {attribute}.")
+    if not callable(found):
+        raise BadInput(f"The {kind} {name!r} is a {type(found).__name__}, not a class or a function.")
+    return found
 
 
 def selection(config: Config) -> Rule:

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 from senior.config import (
     SAC,
-    Bilevel,
     Config,
     Evaluation,
     Networks,
@@ -61,7 +60,7 @@ def paper(task: str, row: Method) -> Config:
 
 
 def quick(task: str, row: Method) -> Config:
-    """For a CPU: one policy in minutes, with the same algorithm and smaller numbers."""
+    """For a CPU: one policy in minutes, with the same algorithm and other numbers (docs/methods.md says why)."""
     config = paper(task, row)
     small = Networks(layers=2, width=128, reward_layers=2, reward_width=128)
     config = replace(
@@ -69,7 +68,7 @@ def quick(task: str, row: Method) -> Config:
         preset="quick",
         steps=60_000,
         networks=small,
-        sac=SAC(batch=128, actor_rate=1e-3, critic_rate=1e-3, rate_end=0.0),
+        sac=SAC(batch=128, actor_rate=1e-3, critic_rate=1e-3, alpha_rate=3e-4, rate_end=0.0, updates=2),
         snapshot_every=10_000,
         evaluation=Evaluation(every=5000),
     )
@@ -77,11 +76,8 @@ def quick(task: str, row: Method) -> Config:
         return replace(config, pretraining=Pretraining(random_steps=1000, until=0))
     return replace(
         config,
-        pretraining=Pretraining(random_steps=1000, until=4000),
-        queries=replace(config.queries, budget=250, per_session=25, every=2500),
+        queries=replace(config.queries, budget=250, per_session=25, episodes=20),
         reward=Reward(epochs=50),
-        pge=replace(config.pge, every=500),
-        bilevel=Bilevel(every=5000),
     )
 
 

@@ -66,9 +66,15 @@ def train(
     if seeds < 1:
         raise BadInput(f"--seeds must be at least 1, not {seeds}.")
     check(config)
+    check(replace(config, seed=config.seed + seeds - 1))
     device = prepare_device(config.device)
     config = replace(config, device=device)
     learner = make_learner(config)
+    if config.method.learns_reward and learner.spec.horizon <= config.queries.segment:
+        raise BadInput(
+            f"A segment of {config.queries.segment} steps does not fit into an episode of {learner.spec.horizon}; "
+            "lower --segment."
+        )
     trainees = []
     for number in range(seeds):
         own = replace(config, seed=config.seed + number)
@@ -94,7 +100,12 @@ def resume(path: Path | str, watcher: Watcher | None = None) -> list[Result]:
         learner = make_learner(config)
         trainee = Trainee(config, directory, learner)
         _compare_protocol(trainee, device, watcher)
-        waiting.append((trainee, trainee.resume(watcher.say)))
+        try:
+            waiting.append((trainee, trainee.resume(watcher.say)))
+        except BadInput:
+            for opened in (trainee, *(other for other, _ in waiting)):
+                opened.close()
+            raise
     results = []
     while waiting:
         first = waiting[0][0]

@@ -1,7 +1,8 @@
 """A run's directory: its files, their columns, and how long each was at a checkpoint (README, "The run directory").
 
 CSV files are the truth; TensorBoard mirrors them. Nothing that depends on the clock is written outside
-``timing.csv``, ``tensorboard/`` and the time of an answer, so equal seeds give equal files.
+``timing.csv`` (whose length checkpoints remember), ``tensorboard/`` and the time of an answer, so equal seeds give
+equal files.
 """
 
 from __future__ import annotations
@@ -173,7 +174,7 @@ class RunDirectory:
 
 def read_protocol(path: Path) -> dict[str, Any]:
     """The protocol in a run's ``config.json``."""
-    return json.loads((path / "config.json").read_text())["protocol"]
+    return json.loads((path / "config.json").read_text()).get("protocol", {})
 
 
 def protocol(spec: EnvSpec, device: str) -> dict[str, Any]:

@@ -104,10 +104,8 @@ class Runs:
 @lru_cache(maxsize=256)
 def compiled(of_one: Callable[..., Any], lift: Lift, use: Literal["every", "one"], donate: bool) -> Any:
     """A function of one run, lifted and compiled. The same function is the same program for all that use it."""
-    if lift == "loop":
-        function = of_one
-    else:
-        function = jax.vmap(of_one) if use == "every" else _at(of_one)
+    at_all = jax.vmap if use == "every" else _at
+    function = of_one if lift == "loop" else at_all(of_one)
     return jax.jit(function, donate_argnums=0 if donate else ())
 
 

@@ -120,6 +120,7 @@ class Trainee:
             return self.learner.init(self.config.seed)
         step, run, progress = found
         self.progress = Progress(**progress)
+        self.progress.written = int(run.replay.count)  # the checkpoint was made before its own chunk was counted
         self.directory.truncate(self.progress.lengths, step)
         self._open_preferences(self.progress.last_pair)
         self._relive(run)
@@ -145,7 +146,12 @@ class Trainee:
             )
 
     def save(self, run: Run, step: int) -> None:
-        """Write a checkpoint at the beginning of ``step``, and the policy beside it."""
+        """Write the policy and a checkpoint at the beginning of ``step``.
+
+        The policy first: a run that is killed between the two then writes it again, where the other way round one
+        killed after its last checkpoint would keep an older policy for ever.
+        """
+        self.directory.save_policy({**policy_arrays(run), "step": np.array(step)})
         progress = self.progress
         progress.step = step
         progress.lengths = self.directory.lengths()
