@@ -165,7 +165,7 @@ def test_cross_entropy_stays_finite_for_logits_far_apart():
 @pytest.mark.parametrize("labels", [[FIRST], [SECOND], [EQUAL], mixed(7)], ids=str)
 @pytest.mark.parametrize("part", [32, 3])
 def test_a_step_follows_the_gradient_of_bradley_terry_on_summed_rewards(labels: list[int], part: int):
-    """The gradient is read from Adam's first moment: means in place of sums, or over rows that hold no label, differ."""
+    """The gradient is read from Adam's first moment: means in place of sums, or over rows without a label, differ."""
     before, labelled = model_of(4), labelled_of(labels, garbage=3.0)
     after, _ = fit(part=part)(before, labelled, jax.random.key(0), ONE_EPOCH)
     gradient = numeric_gradient(lambda members: loss_by_hand(members, labelled), flat(before.members))

@@ -12,7 +12,7 @@ from senior.types import Pairs, Preferred, Query
 def query_of(reward: object) -> Query:
     """A query whose pairs have those true rewards ``[P, 2, H]``; everything else says the opposite."""
     given = np.asarray(reward, np.float32)
-    p, _, h = given.shape
+    p, _, _ = given.shape
     nothing = np.zeros((p, 2), np.int64)
     return Query(
         Pairs(-given[..., None], -given[..., None], given, nothing, nothing),

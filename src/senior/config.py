@@ -306,9 +306,7 @@ def check(config: Config) -> Config:
     ):
         _require(0 <= value < float("inf"), f"{name} must be 0 or more, not {value}.")
     _require(config.seed < 2**32, f"--seed must be below {2**32}, not {config.seed}.")
-    _require(
-        queries.episodes >= 2, f"--candidate-episodes must be at least 2, as pairs need, not {queries.episodes}."
-    )
+    _require(queries.episodes >= 2, f"--candidate-episodes must be at least 2, as pairs need, not {queries.episodes}.")
     for name, number in (
         ("--bandwidth-mds", config.mds.bandwidth),
         ("--bandwidth-pge", config.pge.bandwidth),

@@ -64,7 +64,7 @@ class Clock:
 
     def row(self, step: int) -> dict[str, float]:
         """The parts since the last row, and the rate at which all runs together advanced; the same for every run."""
-        if step == self.last_step:
+        if step == self.last_step and self.latest:
             return self.latest
         now = time.perf_counter()
         rate = (step - self.last_step) / (now - self.last)

@@ -11,8 +11,10 @@ from typing import NamedTuple
 
 from senior.config import (
     SAC,
+    Bilevel,
     Config,
     Evaluation,
+    MotionDistinction,
     Networks,
     Pretraining,
     Reward,
@@ -29,6 +31,7 @@ class TaskNumbers(NamedTuple):
     per_session: int
     refresh_every: int
     ours: bool = False
+    segment: int = 50
 
 
 PAPER: dict[str, TaskNumbers] = {
@@ -40,6 +43,7 @@ PAPER: dict[str, TaskNumbers] = {
     "door-unlock": TaskNumbers(1000, 20, 500),
     "door-close": TaskNumbers(250, 5, 1000, ours=True),
     "box-close": TaskNumbers(1000, 10, 1000, ours=True),
+    "point": TaskNumbers(250, 5, 1000, ours=True, segment=10),  # its episodes have 50 steps
 }
 OTHERS = TaskNumbers(250, 5, 1000, ours=True)
 """For environments that are no task of the table."""
@@ -54,7 +58,9 @@ def paper(task: str, row: Method) -> Config:
         return replace(config, pretraining=Pretraining(random_steps=5000, until=0))
     return replace(
         config,
-        queries=replace(config.queries, budget=numbers.budget, per_session=numbers.per_session),
+        queries=replace(
+            config.queries, budget=numbers.budget, per_session=numbers.per_session, segment=numbers.segment
+        ),
         pge=replace(config.pge, every=numbers.refresh_every),
     )
 
@@ -76,8 +82,10 @@ def quick(task: str, row: Method) -> Config:
         return replace(config, pretraining=Pretraining(random_steps=1000, until=0))
     return replace(
         config,
-        queries=replace(config.queries, budget=250, per_session=25, episodes=20),
+        queries=replace(config.queries, budget=250, per_session=5, every=1000, episodes=10),
         reward=Reward(epochs=50),
+        mds=MotionDistinction(keep=1.0),
+        bilevel=Bilevel(every=5000),
     )
 
 
