@@ -72,7 +72,7 @@ def quick(task: str, row: Method) -> Config:
     config = replace(
         config,
         preset="quick",
-        steps=60_000,
+        steps=80_000,
         networks=small,
         sac=SAC(batch=128, actor_rate=1e-3, critic_rate=1e-3, alpha_rate=3e-4, rate_end=0.0, updates=2),
         snapshot_every=10_000,
@@ -82,9 +82,11 @@ def quick(task: str, row: Method) -> Config:
         return replace(config, pretraining=Pretraining(random_steps=1000, until=0))
     return replace(
         config,
-        queries=replace(config.queries, budget=250, per_session=5, every=1000, episodes=10),
+        pretraining=Pretraining(until=20_000),
+        queries=replace(config.queries, budget=250, per_session=25, every=2500),
         reward=Reward(epochs=50),
         mds=MotionDistinction(keep=1.0),
+        pge=replace(config.pge, every=500),
         bilevel=Bilevel(every=5000),
     )
 
