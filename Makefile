@@ -40,9 +40,10 @@ install: .venv/.installed  ## install the program and what it needs into .venv
 	@$(BIN)/python $(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@
 
-demo: install  ## train SENIOR on door-close with few labels, into a new directory under runs/
+demo: install  ## train SENIOR on door-close with few labels, into a new directory under runs/, and judge it
 	@out=runs/demo; n=1; while [ -e $$out ]; do n=$$((n + 1)); out=runs/demo-$$n; done; \
-	set -x; $(BIN)/senior train --task door-close --method m-senior --preset quick --seed 0 --out $$out $(ARGS)
+	set -ex; $(BIN)/senior train --task door-close --method m-senior --preset quick --out $$out $(ARGS); \
+	$(BIN)/senior eval $$out --episodes 50
 
 test: install  ## run the tests
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(ARGS)

@@ -12,7 +12,7 @@ import pytest
 from senior import envs
 from senior.config import SAC, Config, Queries, check, differences, from_json, load, to_json
 from senior.methods import METHODS, Method
-from senior.presets import PRESETS, preset
+from senior.presets import PRESETS, preset, quick_changes
 from senior.types import BadInput
 
 EVERYTHING = [(name, task, row) for name in PRESETS for task in [*envs.names(), "some-other-robot"] for row in METHODS]
@@ -24,6 +24,10 @@ def test_every_preset_makes_sense_and_survives_json(name: str, task: str, row: s
     assert check(config) is config
     assert (config.preset, config.task, config.method) == (name, task, METHODS[row])
     assert from_json(json.loads(json.dumps(to_json(config)))) == config
+
+
+def test_the_readme_tells_what_quick_changes():
+    assert f"```\n{quick_changes()}\n```" in (Path(__file__).parents[1] / "README.md").read_text()
 
 
 @pytest.mark.parametrize("name", PRESETS)
