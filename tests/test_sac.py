@@ -313,3 +313,10 @@ def test_q_of_a_constant_reward_is_the_reward_or_its_geometric_sum():
     agent = agent_of(26)._replace(log_alpha=jnp.log(1e-8))
     for bootstrap, q in ((0.0, reward), (1.0, reward / (1 - 0.5))):
         np.testing.assert_allclose(np.asarray(learned(agent, bootstrap)).mean(axis=1), q, rtol=0.05)
+
+
+def test_no_layer_is_made_by_a_library_call_that_can_wait_for_ever():
+    """JAX's QR can deadlock on a CPU of two cores (`networks.orthogonal`)."""
+    text = jax.jit(lambda key: sac.init(key, 7, A, 3, 16, 0.1)).lower(jax.random.key(0)).as_text()
+    assert "lapack" not in text
+    assert "qr" not in text.lower().replace("sqrt", "")

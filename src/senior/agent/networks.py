@@ -26,8 +26,21 @@ class MLP(NamedTuple):
 
 
 def orthogonal(key: PRNGKeyArray, size_in: int, size_out: int) -> tuple[Array, Array]:
-    """Orthogonal weights with gain 1, zero biases: every layer of SAC in PEBBLE's line of work."""
-    return jax.nn.initializers.orthogonal()(key, (size_in, size_out)), jnp.zeros(size_out)
+    """Orthogonal weights with gain 1, zero biases: every layer of SAC in PEBBLE's line of work.
+
+    Gram and Schmidt, each column twice for float32's sake, gives what a QR decomposition gives. JAX's QR is not used:
+    on a CPU two at a time can wait for each other for ever (jaxlib 0.10.2; CONTRIBUTING.md).
+    """
+    drawn = jax.random.normal(key, (max(size_in, size_out), min(size_in, size_out)))
+
+    def add_column(i: Array, done: Array) -> Array:
+        column = drawn[:, i]
+        for _ in range(2):
+            column = column - done @ (done.T @ column)
+        return done.at[:, i].set(column / jnp.linalg.norm(column))
+
+    made = jax.lax.fori_loop(0, drawn.shape[1], add_column, jnp.zeros_like(drawn))
+    return made.T if size_in < size_out else made, jnp.zeros(size_out)
 
 
 def fan_in_uniform(key: PRNGKeyArray, size_in: int, size_out: int) -> tuple[Array, Array]:
