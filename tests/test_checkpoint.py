@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from senior import replay
+from senior import checkpoint, replay
 from senior.checkpoint import Damaged, newest, pack, restore, save, steps, unpack, write_atomically
 from senior.learner import Run
 from senior.replay import Fact
@@ -185,6 +185,14 @@ def test_a_checkpoint_of_another_configuration_is_refused(tmp_path: Path):
     wider = empty()._replace(agent=(jnp.zeros((2, 4)), jnp.int32(0)))  # pyright: ignore[reportArgumentType]
     with pytest.raises(Damaged, match=r"agent\[0\] has another shape than the configuration says"):
         restore(tmp_path, 2, wider)
+
+
+def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with monkeypatch.context() as then:
+        then.setattr(checkpoint, "FORMAT", 99)
+        saved(tmp_path, 2)
+    with pytest.raises(Damaged, match="it has format 99, and this version reads format 1"):
+        restore(tmp_path, 2, empty())
 
 
 @pytest.mark.parametrize("compress", [False, True])

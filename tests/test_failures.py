@@ -52,6 +52,8 @@ class Robot(Point):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         assert seed is not None
         self.faulty = fault is not None and fault.meets(seed)
+        if self.faulty and fault is not None and fault.kind == "reset":
+            raise RuntimeError("brake stuck")
         return super().reset(seed=seed)
 
     def step(self, action: np.ndarray):
@@ -151,6 +153,13 @@ def test_a_break_that_stays_stops_the_run_again(tmp_path: Path, monkeypatch: pyt
     assert again.failure is not None
     assert "motor burnt" in again.failure
     assert (again.finished, again.step) == (False, 32)  # the 29 steps before are lived through again
+
+
+def test_an_environment_that_cannot_begin_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    break_it(monkeypatch, Fault("reset", 0))
+    with pytest.raises(BadInput, match="of seed 1 failed in episode 0 after step 0: RuntimeError: brake stuck"):
+        train(config(), tmp_path / "out", seeds=2)
+    assert not (tmp_path / "out").exists()
 
 
 def test_all_runs_stop_when_all_break(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

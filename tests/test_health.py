@@ -114,7 +114,7 @@ def test_a_warning_is_told_once_per_run_and_kind_and_kept(tmp_path: Path):
 
 def test_a_session_without_episodes_is_told(tmp_path: Path):
     training, said = two_runs(tmp_path)
-    training.trainees[0].progress.recent = [[0, 0, 50], [1, 50, 10]]  # the second is not longer than a segment
+    training.trainees[0].progress.recent = [[0, 0, 50]]
     training.session(0, 400, 10)
     training.session(0, 400, 10)
     (sentence,) = said.sentences

@@ -13,6 +13,7 @@ import pytest
 from senior import parts, replay
 from senior.config import Config, Networks, Pretraining, Queries
 from senior.envs import point
+from senior.envs.vector import Step
 from senior.learner import Learner
 from senior.replay import Fact
 from senior.trainee import Trainee
@@ -173,16 +174,26 @@ def episodes_of(lengths: list[int]) -> list[list[int]]:
     return [[i, int(f), n] for i, (f, n) in enumerate(zip(first, lengths, strict=True))]
 
 
+def live(trainee: Trainee, lengths: list[int]) -> None:
+    """Let the trainee record episodes of those lengths, one after the other."""
+    nothing, step = np.zeros(3, np.float32), trainee.progress.elapsed
+    for length in lengths:
+        for t in range(length):
+            ended = t == length - 1
+            trainee.record(step, Step(nothing, nothing[:2], 0.0, nothing, False, ended, None), 0.0, None)
+            step += 1
+
+
 def test_candidates_are_uniform_over_the_episodes_longer_than_a_segment_and_over_their_starts(tmp_path: Path):
     """Lengths vary: 4 is too short for a segment of 4, 5 leaves one start, the last step is never included."""
     trainee = trainee_in(tmp_path, per_session=400)
     lengths = [9, 4, 5, 6, 3]
-    trainee.progress.recent = episodes_of(lengths)
+    live(trainee, lengths)
     candidates = trainee.candidate_starts(sum(lengths))
     assert candidates is not None
     rows, episode, start = candidates
     assert rows.shape == episode.shape == start.shape == (4000, 2)
-    first = np.array([row[1] for row in trainee.progress.recent])
+    first = np.array([row[1] for row in episodes_of(lengths)])
     assert np.array_equal(rows, first[episode] + start)
     for number, starts in ((0, range(5)), (2, range(1)), (3, range(2))):
         own = start[episode == number]
@@ -202,7 +213,7 @@ def test_a_candidate_lies_inside_one_episode_and_ends_before_its_last_step(tmp_p
             done = t == length - 1
             held = store(held, fact(t, truncated=done, episode=number), np.float32(0), np.float32(0))
     trainee = trainee_in(tmp_path)
-    trainee.progress.recent = episodes_of(lengths)
+    live(trainee, lengths)
     candidates = trainee.candidate_starts(sum(lengths))
     assert candidates is not None
     rows, episode, start = candidates
@@ -216,13 +227,20 @@ def test_a_candidate_lies_inside_one_episode_and_ends_before_its_last_step(tmp_p
 @pytest.mark.parametrize("lengths", [[], [9], [9, 4, 3]])
 def test_fewer_than_two_usable_episodes_give_no_candidates(tmp_path: Path, lengths: list[int]):
     trainee = trainee_in(tmp_path)
-    trainee.progress.recent = episodes_of(lengths)
+    live(trainee, lengths)
     assert trainee.candidate_starts(sum(lengths)) is None
+
+
+def test_short_episodes_do_not_push_usable_ones_out(tmp_path: Path):
+    trainee = trainee_in(tmp_path)
+    live(trainee, [9, 9, 9] + [4] * 20)
+    candidates = trainee.candidate_starts(107)
+    assert candidates is not None and set(candidates[1].ravel().tolist()) == {0, 1, 2}
 
 
 def test_an_episode_that_the_ring_has_begun_to_overwrite_is_no_candidate(tmp_path: Path):
     trainee = trainee_in(tmp_path, capacity=20)
-    trainee.progress.recent = episodes_of([10, 10, 10])  # at step 31 rows 11 to 30 are stored
+    live(trainee, [10, 10, 10])  # at step 31 rows 11 to 30 are stored
     candidates = trainee.candidate_starts(30)
     assert candidates is not None and set(candidates[1].ravel().tolist()) == {1, 2}
     assert trainee.candidate_starts(31) is None
@@ -230,7 +248,7 @@ def test_an_episode_that_the_ring_has_begun_to_overwrite_is_no_candidate(tmp_pat
 
 def test_candidates_of_a_step_are_always_the_same_and_those_of_another_are_not(tmp_path: Path):
     trainee = trainee_in(tmp_path)
-    trainee.progress.recent = episodes_of([40, 40])
+    live(trainee, [40, 40])
     one, again, other = (trainee.candidate_starts(step) for step in (80, 80, 85))
     assert one is not None and again is not None and other is not None
     assert np.array_equal(one[0], again[0]) and not np.array_equal(one[0], other[0])

@@ -163,6 +163,13 @@ def test_all_seeds_under_a_directory_go_on_wherever_each_stands(reference: Path,
         assert_same_run(tmp_path / seed, reference / seed, interrupted=True)
 
 
+def test_a_run_that_an_interrupt_kept_from_going_on_is_among_the_results(reference: Path, tmp_path: Path):
+    train(short(), tmp_path, seeds=2, watcher=Stop(470))
+    resume(tmp_path / "seed-1", Stop(655))
+    results = resume(tmp_path, Stop(480))  # one after the other; the second is not begun
+    assert [(result.seed, result.step, result.finished) for result in results] == [(0, 480, False), (1, 655, False)]
+
+
 def test_interrupted_at_awkward_moments(reference: Path, tmp_path: Path):
     """Before the first step, at a checkpoint, at an episode's end, around a session, right before the end."""
     for result in train(short(), tmp_path, watcher=Stop(1)):
@@ -235,14 +242,15 @@ class Moody(Point):
         return super().reset(seed=int(self.moods.integers(1 << 30)))
 
 
+@pytest.mark.parametrize(("stop", "elapsed"), [(70, 20), (100, 0)], ids=["amid an episode", "between episodes"])
 @pytest.mark.parametrize("name", ["tests.test_resume:Moody", "senior.envs.point:Point"])
-def test_only_an_environment_that_repeats_itself_can_be_resumed(name: str, tmp_path: Path):
+def test_only_an_environment_that_repeats_itself_can_be_resumed(name: str, stop: int, elapsed: int, tmp_path: Path):
     config = short(env=name, position="0:2", steps=500)
-    (result,) = train(config, tmp_path, watcher=Stop(70))
-    assert progress_of(result.path)["elapsed"] == 20
+    (result,) = train(config, tmp_path, watcher=Stop(stop))
+    assert progress_of(result.path)["elapsed"] == elapsed
     if name.startswith("senior"):
-        (result,) = resume(tmp_path, Stop(80))
-        assert result.step == 80
+        (result,) = resume(tmp_path, Stop(110))
+        assert result.step == 110
         return
     with pytest.raises(BadInput) as caught:
         resume(tmp_path, Stop())

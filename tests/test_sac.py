@@ -14,12 +14,12 @@ from senior.agent.networks import MLP
 from senior.types import Batch, Source
 
 O, A, B = 3, 2, 6
-NUMBERS = sac.Numbers(actor_rate=1e-3, critic_rate=2e-3, alpha_rate=5e-3, discount=0.9, tau=0.25, average=0.0)
+NUMBERS = sac.Numbers(actor_rate=1e-3, critic_rate=2e-3, alpha_rate=5e-3, discount=0.9, tau=0.25, target_entropy=-1.5)
 Arrays = list[np.ndarray]
 
 
 def agent_of(seed: int, layers: int = 2, width: int = 5, alpha: float = 0.3) -> sac.Agent:
-    """A small agent whose targets, average and biases differ from what they begin as."""
+    """A small agent whose targets and biases differ from what they begin as."""
     agent = sac.init(jax.random.key(seed), O, A, layers, width, alpha)
     rng = np.random.default_rng(seed)
 
@@ -28,7 +28,6 @@ def agent_of(seed: int, layers: int = 2, width: int = 5, alpha: float = 0.3) -> 
 
     return agent._replace(
         actor=shaken(agent.actor),
-        average=shaken(agent.average),
         critics=shaken(agent.critics),
         targets=shaken(agent.targets),
     )
@@ -208,22 +207,22 @@ def test_actor_descends_on_alpha_log_pi_minus_the_smaller_q():
     np.testing.assert_allclose(info["entropy"], -log_prob.mean(), rtol=1e-4)
     gradient = numeric_gradient(loss, flat(agent.actor))
     assert_first_adam_step(agent.actor, after.actor, after.actor_adam.mu, gradient, NUMBERS.actor_rate)
-    others = dict.fromkeys(("actor", "average", "actor_adam"))
+    others = dict.fromkeys(("actor", "actor_adam"))
     assert_same(agent._replace(**others), after._replace(**others))
 
 
 @pytest.mark.parametrize("entropy", [-5.0, -2.0, 1.0])
-def test_temperature_draws_the_entropy_towards_minus_the_number_of_actions(entropy: float):
+def test_temperature_draws_the_entropy_towards_its_target(entropy: float):
     agent = agent_of(11)
     after, info = sac.update_temperature(agent, jnp.float32(entropy), A, NUMBERS)
 
     def loss(log_alpha: Arrays) -> float:
-        return float(np.exp(log_alpha[0][0]) * (entropy - (-A)))  # -log pi is the entropy
+        return float(np.exp(log_alpha[0][0]) * (entropy - (-1.5 * A)))  # -log pi is the entropy
 
     (gradient,) = numeric_gradient(loss, [np.array([float(agent.log_alpha)])])
     np.testing.assert_allclose(after.alpha_adam.mu / 0.1, gradient[0], rtol=1e-4, atol=1e-8)
     moved = float(after.log_alpha - agent.log_alpha)
-    np.testing.assert_allclose(moved, -NUMBERS.alpha_rate * np.sign(entropy + A), rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(moved, -NUMBERS.alpha_rate * np.sign(entropy + 1.5 * A), rtol=1e-3, atol=1e-9)
     np.testing.assert_allclose(info["alpha"], np.exp(after.log_alpha), rtol=1e-6)
 
 
@@ -242,7 +241,7 @@ def test_an_update_is_critics_then_actor_then_temperature_on_one_batch():
     gradient = numeric_gradient(loss, flat(agent.actor))
     assert_first_adam_step(agent.actor, after.actor, after.actor_adam.mu, gradient, NUMBERS.actor_rate)
     entropy = -policy(flat(agent.actor), batch.observation, noise)[1].mean()
-    np.testing.assert_allclose(after.alpha_adam.mu / 0.1, alpha * (entropy + A), rtol=1e-3)
+    np.testing.assert_allclose(after.alpha_adam.mu / 0.1, alpha * (entropy + 1.5 * A), rtol=1e-3)
     assert [int(s.count) for s in (after.critic_adam, after.actor_adam, after.alpha_adam)] == [1, 1, 1]
 
 
@@ -271,7 +270,7 @@ def test_renewed_critics_take_targets_and_optimiser_along_and_leave_actor_and_te
     agent, batch = agent_of(18), batch_of(19)
     agent, _ = jax.jit(sac.update)(agent, batch, batch.reward, jax.random.key(20), NUMBERS, True)
     new = sac.renew_critics(agent, jax.random.key(21))
-    for name in ("actor", "average", "log_alpha", "actor_adam", "alpha_adam"):
+    for name in ("actor", "log_alpha", "actor_adam", "alpha_adam"):
         assert_same(getattr(new, name), getattr(agent, name))
     for old, fresh in zip(agent.critics.weights, new.critics.weights, strict=True):
         assert old.shape == fresh.shape and not np.any(old == fresh)
@@ -279,16 +278,6 @@ def test_renewed_critics_take_targets_and_optimiser_along_and_leave_actor_and_te
     assert_same(new.targets, new.critics)
     assert int(agent.critic_adam.count) == 1
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(new.critic_adam))
-
-
-@pytest.mark.parametrize("decay", [0.0, 0.75])
-def test_the_average_follows_the_actor_with_its_decay_and_is_the_actor_at_zero(decay: float):
-    agent, batch = agent_of(22), batch_of(23)
-    after, _ = jax.jit(sac.update_actor)(agent, batch, jax.random.key(24), NUMBERS._replace(average=decay))
-    if decay == 0:
-        assert_same(after.average, after.actor)
-    for old, new, actor in zip(flat(agent.average), flat(after.average), flat(after.actor), strict=True):
-        np.testing.assert_allclose(new, decay * old + (1 - decay) * actor, atol=1e-6)
 
 
 # A task with a known Q.

@@ -111,6 +111,7 @@ def measure(config: Config, runs: int, device: str, length: int, out: Path) -> d
     learner = program.make_learner(config)
     trainees = [Trainee(replace(config, seed=i), out / f"seed-{i}", learner) for i in range(runs)]
     for trainee in trainees:
+        trainee.reset(0)
         trainee.directory.create(trainee.config, {})
     window = Window(None, start, length)
     states = Runs([trainee.begin() for trainee in trainees], lift_for(device))

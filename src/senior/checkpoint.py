@@ -107,6 +107,8 @@ def restore(directory: Path, step: int, template: Run) -> tuple[Run, dict[str, A
     saved = unpack(path)
     try:
         about = json.loads(saved["about"].tobytes())
+        if about["format"] != FORMAT:
+            raise ValueError(f"it has format {about['format']}, and this version reads format {FORMAT}")
         replay, count = template.replay, about["count"]
         facts = {name: np.array(column) for name, column in replay.facts._asdict().items()}
         for first, last, chunk in _chunks(directory, count, replay.capacity):

@@ -7,6 +7,7 @@ Every number that a paper leaves open is a named field here, with the reading we
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -67,9 +68,8 @@ class SAC:
     """Updates per environment step in the main phase."""
     reset_updates: int = 100
     """Updates right after the critics are renewed at the end of pre-training."""
-    evaluate_average: float = 0.0
-    """Decay of the running average of the actor's weights that is evaluated and delivered. 0: the actor itself, as in
-    the papers."""
+    target_entropy: float = -1.0
+    """Entropy per action dimension that the temperature draws the policy towards."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Queries:
     segment: int = 50
     """Steps of a segment (H)."""
     episodes: Annotated[int, _flag("candidate-episodes")] = 100
-    """How many of the latest complete episodes segments are cut from."""
+    """How many of the latest complete episodes that are longer than a segment pairs are cut from."""
     pool: int = 10
     """Candidate pairs per asked pair: the pool p has this times M pairs."""
 
@@ -325,13 +325,16 @@ def check(config: Config) -> Config:
         ("--sac.tau", config.sac.tau),
         ("--sac.discount", config.sac.discount),
         ("--sac.rate-end", config.sac.rate_end),
-        ("--sac.evaluate-average", config.sac.evaluate_average),
         ("--reward.stop-accuracy", config.reward.stop_accuracy),
     ):
         _require(0 <= share <= 1, f"{name} must lie between 0 and 1, not {share}.")
     _require(
         config.precision == "float32",
         "--precision bfloat16 is not offered yet: its learning curves have not been compared with float32's.",
+    )
+    _require(
+        math.isfinite(config.sac.target_entropy),
+        f"--sac.target-entropy must be a number, not {config.sac.target_entropy}.",
     )
     row.check()
     until, random_steps = config.pretraining.until, config.pretraining.random_steps

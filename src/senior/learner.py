@@ -74,7 +74,7 @@ def _numbers(config: Config) -> Numbers:
             config.sac.alpha_rate,
             config.sac.discount,
             config.sac.tau,
-            config.sac.evaluate_average,
+            config.sac.target_entropy,
         ),
         model.FitNumbers(config.reward.rate, config.reward.epochs, config.reward.stop_accuracy),
         bilevel.OuterNumbers(config.sac.critic_rate, config.reward.rate, config.bilevel.weight, config.sac.discount),
@@ -299,7 +299,7 @@ def act(
 
 
 def mean_action(actor: MLP, observation: Float[Array, " o"]) -> Float[Array, " a"]:
-    """The action that evaluation takes; ``actor`` is ``run.agent.average``."""
+    """The action that evaluation takes; ``actor`` is ``run.agent.actor``."""
     return sac.mean_action(actor, observation)
 
 

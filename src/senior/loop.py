@@ -287,7 +287,7 @@ class Training:
         """Judge the policy on fresh episodes; False if the environment broke."""
         trainee = self.trainees[i]
         config, progress = trainee.config, trainee.progress
-        actor = self.runs.view(i, lambda run: run.agent.average)
+        actor = self.runs.view(i, lambda run: run.agent.actor)
         count = config.evaluation.episodes
         first = -(-step // config.evaluation.every) * count
         try:

@@ -75,12 +75,18 @@ def train(
             f"A segment of {config.queries.segment} steps does not fit into an episode of {learner.spec.horizon}; "
             "lower --segment."
         )
+    if config.capacity < min(learner.spec.horizon, config.steps):
+        raise BadInput(
+            f"A replay of {config.capacity} rows cannot hold an episode of {learner.spec.horizon} steps; raise "
+            "--replay-capacity."
+        )
     trainees = []
     for number in range(seeds):
         own = replace(config, seed=config.seed + number)
         trainees.append(Trainee(own, Path(out) / f"seed-{own.seed}", learner))
     for trainee in trainees:
         trainee.directory.check_free()
+        trainee.reset(0)
     for trainee in trainees:
         trainee.directory.create(trainee.config, rundir.protocol(learner.spec, device))
     runs = Runs([trainee.begin() for trainee in trainees], lift or lift_for(device))
@@ -122,7 +128,9 @@ def resume(path: Path | str, watcher: Watcher | None = None) -> list[Result]:
         runs = Runs([run for _, run in together], lift_for(first.config.device))  # pyright: ignore[reportArgumentType]
         results += _run(trainees, runs, watcher)
         if watcher.stop:
-            break
+            for trainee, _ in waiting:
+                trainee.close()
+            return results + [_finish(trainee) for trainee, _ in waiting]
     return results
 
 

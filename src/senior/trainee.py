@@ -41,7 +41,7 @@ class Progress:
     elapsed: int = 0
     episode_return: float = 0.0
     episode_success: float | None = None
-    recent: list[list[int]] = field(default_factory=list)  # [episode, first row, length] of complete episodes
+    recent: list[list[int]] = field(default_factory=list)  # [episode, first row, length] of those pairs are cut from
     measured: bool = False  # the length scale was taken from the data
     right: list[int] = field(default_factory=list)  # per session, new pairs predicted rightly before the fit
     decided: list[int] = field(default_factory=list)  # of so many
@@ -99,12 +99,15 @@ class Trainee:
     # Beginning, saving, resuming.
 
     def begin(self) -> Run:
-        """A new run in a new directory."""
-        failed = self.environment.begin(0, 0)
-        if failed:
-            raise BadInput(failed.message)
+        """A new run in a new directory, whose environment stands at its first step (`reset`)."""
         self._open_preferences(0)
         return self.learner.init(self.config.seed)
+
+    def reset(self, episode: int) -> None:
+        """Bring the environment to the beginning of an episode; `BadInput` if it cannot."""
+        failed = self.environment.begin(0, episode)
+        if failed:
+            raise BadInput(failed.message)
 
     def resume(self, tell: Callable[[str], None]) -> Run:
         """The newest checkpoint that can be read, or the beginning if there is none yet."""
@@ -113,11 +116,8 @@ class Trainee:
             if any(self.directory.checkpoints.glob("step-*.npz")):
                 raise BadInput(f"No checkpoint in {self.directory.path} can be read; the run cannot be resumed.")
             self.directory.forget_everything()
-            self._open_preferences(0)
-            failed = self.environment.begin(0, 0)
-            if failed:
-                raise BadInput(failed.message)
-            return self.learner.init(self.config.seed)
+            self.reset(0)
+            return self.begin()
         step, run, progress = found
         self.progress = Progress(**progress)
         self.progress.written = int(run.replay.count)  # the checkpoint was made before its own chunk was counted
@@ -132,10 +132,19 @@ class Trainee:
             self.preferences.truncate(last)
 
     def _relive(self, run: Run) -> None:
-        """Bring the environment to where the run stands, by the running episode's seed and actions."""
-        rows = np.arange(int(run.replay.count) - self.progress.elapsed, int(run.replay.count))
+        """Bring the environment to where the run stands, by the running episode's seed and actions.
+
+        An environment that does not repeat itself is found out on the way. Where no episode is running, the latest
+        one is lived through again for that.
+        """
+        progress, count = self.progress, int(run.replay.count)
+        episode, rows = progress.episode, np.arange(count - progress.elapsed, count)
+        latest = progress.recent[-1:]
+        if not progress.elapsed and latest and latest[0][1] >= count - run.replay.capacity:
+            episode, first, length = latest[0]
+            rows = np.arange(first, first + length)
         rows = rows % run.replay.capacity
-        steps = self.environment.restore(0, self.progress.episode, np.asarray(run.replay.facts.action)[rows])
+        steps = self.environment.restore(0, episode, np.asarray(run.replay.facts.action)[rows])
         if isinstance(steps, Failure):
             raise BadInput(f"The run cannot go on: {steps.message}")
         stored = np.asarray(run.replay.facts.next_observation)[rows]
@@ -144,6 +153,8 @@ class Trainee:
                 f"The environment {self.spec.name} does not repeat an episode from its seed and actions, so the run in "
                 f"{self.directory.path} cannot be resumed exactly; its reset must honour the seed it is given."
             )
+        if not progress.elapsed:
+            self.reset(progress.episode)
 
     def save(self, run: Run, step: int) -> None:
         """Write the policy and a checkpoint at the beginning of ``step``.
@@ -151,13 +162,12 @@ class Trainee:
         The policy first: a run that is killed between the two then writes it again, where the other way round one
         killed after its last checkpoint would keep an older policy for ever.
         """
-        self.directory.save_policy({**policy_arrays(run), "step": np.array(step)})
+        self.directory.save_policy({**policy_arrays(run), "step": np.asarray(step)})
         progress = self.progress
         progress.step = step
         progress.lengths = self.directory.lengths()
         progress.last_pair = self.preferences.last if self.config.method.learns_reward else 0
         progress.written = checkpoint.save(self.directory.checkpoints, step, run, asdict(progress), progress.written)
-        self.directory.save_policy({**policy_arrays(run), "step": np.asarray(step)})
 
     def close(self) -> None:
         """Close environments and files."""
@@ -200,8 +210,9 @@ class Trainee:
         )
         if learned is not None:
             progress.learned_returns.append(learned)
-        progress.recent.append([progress.episode, step + 1 - progress.elapsed, progress.elapsed])
-        del progress.recent[: -self.config.queries.episodes]
+        if progress.elapsed > self.config.queries.segment:
+            progress.recent.append([progress.episode, step + 1 - progress.elapsed, progress.elapsed])
+            del progress.recent[: -self.config.queries.episodes]
         progress.episode += 1
         progress.elapsed, progress.episode_return, progress.episode_success = 0, 0.0, None
 
@@ -210,15 +221,11 @@ class Trainee:
     def candidate_starts(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Rows, episodes and first steps, each ``[P, 2]``, of independently drawn candidate pairs.
 
-        Episodes are uniform over the latest complete ones that are longer than a segment and still in the replay;
-        starts are uniform, the episode's last step excluded. None if there are fewer than two such episodes.
+        Episodes are uniform over the latest complete ones that are longer than a segment and still in the replay at
+        ``step``; starts are uniform, the episode's last step excluded. None if there are fewer than two such episodes.
         """
-        queries, stored = self.config.queries, step
-        usable = [
-            (episode, first, length)
-            for episode, first, length in self.progress.recent
-            if length > queries.segment and first >= stored - self.config.capacity
-        ]
+        queries = self.config.queries
+        usable = [row for row in self.progress.recent if row[1] >= step - self.config.capacity]
         if len(usable) < 2:
             return None
         episode, first, length = np.array(usable).T
@@ -245,7 +252,7 @@ class Trainee:
 
 def policy_arrays(run: Run) -> dict[str, np.ndarray]:
     """The delivered policy: per layer ``weight_i [in, out]`` and ``bias_i [out]``."""
-    actor = run.agent.average
+    actor = run.agent.actor
     return {
         f"{kind}_{i}": np.asarray(layer)
         for kind, layers in (("weight", actor.weights), ("bias", actor.biases))

@@ -23,7 +23,6 @@ class Agent(NamedTuple):
     """Everything that SAC learns."""
 
     actor: MLP
-    average: MLP  # running average of the actor's weights, for evaluation where that is asked for
     critics: MLP  # leading axis 2
     targets: MLP  # leading axis 2
     log_alpha: Float[Array, ""]
@@ -40,8 +39,7 @@ class Numbers(NamedTuple):
     alpha_rate: Float[Array, ""] | float
     discount: Float[Array, ""] | float
     tau: Float[Array, ""] | float
-    average: Float[Array, ""] | float  # decay of the running average of the actor
-    """Nothing else of SAC is numeric: the target entropy is minus the number of actions."""
+    target_entropy: Float[Array, ""] | float  # per action dimension
 
 
 def init(key: PRNGKeyArray, observation_size: int, action_size: int, layers: int, width: int, alpha: float) -> Agent:
@@ -52,7 +50,6 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, layers: int
     log_alpha = jnp.log(jnp.asarray(alpha, jnp.float32))
     return Agent(
         actor,
-        jax.tree.map(jnp.copy, actor),
         critics,
         jax.tree.map(jnp.copy, critics),
         log_alpha,
@@ -130,7 +127,7 @@ def update_critics(
 
 
 def update_actor(agent: Agent, batch: Batch, key: PRNGKeyArray, numbers: Numbers) -> tuple[Agent, dict[str, Array]]:
-    """One Adam step of the actor on alpha log pi - min_j Q_j, and of its running average."""
+    """One Adam step of the actor on alpha log pi - min_j Q_j."""
 
     def loss_of(actor: MLP) -> tuple[Array, Array]:
         action, log_prob = sample(actor, batch.observation, key)
@@ -139,16 +136,14 @@ def update_actor(agent: Agent, batch: Batch, key: PRNGKeyArray, numbers: Numbers
 
     (loss, entropy), gradient = jax.value_and_grad(loss_of, has_aux=True)(agent.actor)
     actor, state = descend(agent.actor, gradient, agent.actor_adam, numbers.actor_rate)
-    average = jax.tree.map(lambda slow, fast: fast + numbers.average * (slow - fast), agent.average, actor)
-    agent = agent._replace(actor=actor, average=average, actor_adam=state)
-    return agent, {"actor_loss": loss, "entropy": entropy}
+    return agent._replace(actor=actor, actor_adam=state), {"actor_loss": loss, "entropy": entropy}
 
 
 def update_temperature(
     agent: Agent, entropy: Float[Array, ""], action_size: int, numbers: Numbers
 ) -> tuple[Agent, dict[str, Array]]:
-    """One Adam step of log alpha that draws the policy's entropy towards minus the number of actions."""
-    gradient = jnp.exp(agent.log_alpha) * (entropy + action_size)
+    """One Adam step of log alpha that draws the policy's entropy towards its target."""
+    gradient = jnp.exp(agent.log_alpha) * (entropy - numbers.target_entropy * action_size)
     log_alpha, state = descend(agent.log_alpha, gradient, agent.alpha_adam, numbers.alpha_rate)
     return agent._replace(log_alpha=log_alpha, alpha_adam=state), {"alpha": jnp.exp(log_alpha)}
 
