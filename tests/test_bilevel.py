@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,12 +13,12 @@ from senior.reward import bilevel, model
 from senior.reward.bilevel import FirstSteps, OuterNumbers
 from senior.reward.model import RewardModel
 from senior.types import Batch, Preferred, Source
+from tests.numeric import Arrays, numeric_gradient
 
 O, A, B, M = 3, 2, 6, 4
 FIRST, SECOND, EQUAL = (int(label) for label in (Preferred.FIRST, Preferred.SECOND, Preferred.EQUAL))
 NUMBERS = OuterNumbers(inner_rate=0.05, rate=1e-3, weight=0.1, discount=0.9)
 """The inner rate is large, so that the outer gradient is."""
-Arrays = list[np.ndarray]
 outer_step = jax.jit(bilevel.outer_step, static_argnums=6)
 KEY = jax.random.key(3)
 
@@ -124,20 +122,6 @@ def outer_by_hand(
             to_first, to_second = share[int(label)]
             total -= weight * (to_first * np.log(p) + to_second * np.log(1 - p))
     return float(numbers.weight) * total / max(float(np.sum(pairs.weight)), 1)
-
-
-def numeric_gradient(loss: Callable[[Arrays], float], at: Arrays, step: float = 1e-5) -> Arrays:
-    """Central differences."""
-    gradient = [np.zeros_like(x) for x in at]
-    for x, g in zip(at, gradient, strict=True):
-        for i in np.ndindex(x.shape):
-            kept = x[i]
-            x[i] = kept + step
-            above = loss(at)
-            x[i] = kept - step
-            g[i] = (above - loss(at)) / (2 * step)
-            x[i] = kept
-    return gradient
 
 
 def value_by_hand(agent: sac.Agent, batch: Batch) -> np.ndarray:

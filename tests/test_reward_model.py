@@ -15,12 +15,12 @@ from senior.agent.networks import MLP, apply_mlp, fan_in_uniform
 from senior.reward import model
 from senior.reward.model import FitNumbers, Labelled, RewardModel
 from senior.types import Preferred
+from tests.numeric import Arrays, numeric_gradient
 
 O, A, H, CAPACITY, BATCH = 3, 2, 4, 12, 8
 FIRST, SECOND, EQUAL = (int(label) for label in (Preferred.FIRST, Preferred.SECOND, Preferred.EQUAL))
 RATE = 1e-3
 ONE_EPOCH = FitNumbers(rate=RATE, epochs=1, stop_accuracy=0.97)
-Arrays = list[np.ndarray]
 
 
 @cache
@@ -93,20 +93,6 @@ def loss_by_hand(members: Arrays, labelled: Labelled) -> float:
             to_first, to_second = share[int(label)]
             total -= (to_first * np.log(p) + to_second * np.log(1 - p)) / n
     return total
-
-
-def numeric_gradient(loss: Callable[[Arrays], float], at: Arrays, step: float = 1e-6) -> Arrays:
-    """Central differences."""
-    gradient = [np.zeros_like(x) for x in at]
-    for x, g in zip(at, gradient, strict=True):
-        for i in np.ndindex(x.shape):
-            kept = x[i]
-            x[i] = kept + step
-            above = loss(at)
-            x[i] = kept - step
-            g[i] = (above - loss(at)) / (2 * step)
-            x[i] = kept
-    return gradient
 
 
 # The reward.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +12,10 @@ import pytest
 from senior.agent import sac
 from senior.agent.networks import MLP
 from senior.types import Batch, Source
+from tests.numeric import Arrays, numeric_gradient
 
 O, A, B = 3, 2, 6
 NUMBERS = sac.Numbers(actor_rate=1e-3, critic_rate=2e-3, alpha_rate=5e-3, discount=0.9, tau=0.25, target_entropy=-1.5)
-Arrays = list[np.ndarray]
 
 
 def agent_of(seed: int, layers: int = 2, width: int = 5, alpha: float = 0.3) -> sac.Agent:
@@ -83,20 +83,6 @@ def policy(actor: Arrays, observation: np.ndarray, noise: np.ndarray) -> tuple[n
 
 def noise_of(key: jax.Array, size: int = B) -> np.ndarray:
     return np.asarray(jax.random.normal(key, (size, A)), np.float64)
-
-
-def numeric_gradient(loss: Callable[[Arrays], float], at: Arrays, step: float = 1e-6) -> Arrays:
-    """Central differences."""
-    gradient = [np.zeros_like(x) for x in at]
-    for x, g in zip(at, gradient, strict=True):
-        for i in np.ndindex(x.shape):
-            kept = x[i]
-            x[i] = kept + step
-            above = loss(at)
-            x[i] = kept - step
-            g[i] = (above - loss(at)) / (2 * step)
-            x[i] = kept
-    return gradient
 
 
 def adam_direction(gradient: np.ndarray) -> np.ndarray:
