@@ -17,8 +17,8 @@ from tests.small import preferences_dump, small
 def short(task: str = "point", **changes: Any) -> Config:
     """Pre-training until 400, sessions at 400 and 600 and a cut one at 800, evaluations at 500 and 1000.
 
-    Episodes have 50 steps: of the checkpoints, every 130 steps and at the end, all but 650 and the last lie in the
-    middle of one. The replay overwrites its oldest rows from step 700 on.
+    Snapshots are taken at 300, 600, 900 and 1000. Episodes have 50 steps: of the checkpoints, every 130 steps and at
+    the end, all but 650 and the last lie in the middle of one. The replay overwrites its oldest rows from step 700 on.
     """
     config = small(
         task=task,
@@ -26,7 +26,7 @@ def short(task: str = "point", **changes: Any) -> Config:
         horizon=50,
         replay_capacity=700,
         checkpoint_every=130,
-        snapshot_every=500,
+        snapshot_every=300,
         queries=Queries(budget=25, per_session=10, every=200, segment=10, episodes=12, pool=10),
     )
     return replace(config, **changes)
@@ -34,7 +34,7 @@ def short(task: str = "point", **changes: Any) -> Config:
 
 _OPTIONS = """
 --task point --method m-senior --steps 1000 --horizon 50 --replay-capacity 700 --checkpoint-every 130
---snapshot-every 500 --budget 25 --per-session 10 --session-every 200 --segment 10 --candidate-episodes 12
+--snapshot-every 300 --budget 25 --per-session 10 --session-every 200 --segment 10 --candidate-episodes 12
 --pool 10 --networks.layers 1 --networks.width 32 --networks.reward-layers 1 --networks.reward-width 32
 --sac.batch 64 --sac.actor-rate 3e-3 --sac.critic-rate 3e-3 --sac.alpha-rate 3e-3 --sac.tau 0.02
 --sac.discount 0.9 --sac.reset-updates 20 --pretraining.random-steps 100 --pretraining.until 400

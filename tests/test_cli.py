@@ -116,9 +116,11 @@ NUMBERS = {
     "--sac.actor-rate -1": "--sac.actor-rate must be a positive number",
     "--sac.discount 1.5": "--sac.discount must lie between 0 and 1",
     "--sac.tau x": "--sac.tau needs a number, not 'x'",
-    "--sac.reset-updates -5": "--sac.reset-updates must be 0 or more",
+    "--sac.reset-updates -5": "--sac.reset-updates must be at least 1",
     "--sac.target-entropy nan": "--sac.target-entropy must be a number",
     "--pretraining.random-steps -5": "--pretraining.random-steps must be 0 or more",
+    "--pretraining.random-steps 4": "looks at 5 neighbours, more than there are after 4 random steps",
+    "--pretraining.until 10500": "Q, --refresh-every 1000, must divide the end of pre-training",
     "--pretraining.until 1000": "Pre-training must last beyond its 1000 random steps",
     "--pge.beta nan": "--pge.beta must be 0 or more, not nan",
     "--pge.beta -0.1": "--pge.beta must be 0 or more",
@@ -192,8 +194,30 @@ def test_a_place_that_is_taken_or_cannot_be_written(capsys: pytest.CaptureFixtur
     Path("file").write_text("no directory")
     train = "train --task point --out"
     assert "taken/seed-1 exists and is not empty" in refused(f"{train} taken --seeds 2", capsys)
-    assert "file/seed-0 cannot be written: Not a directory" in refused(f"{train} file", capsys)
-    assert "file/below/seed-0 cannot be written" in refused(f"{train} file/below", capsys)
+    assert "file/seed-0 cannot be read and written: Not a directory" in refused(f"{train} file", capsys)
+    assert "file/below/seed-0 cannot be read and written" in refused(f"{train} file/below", capsys)
+
+
+def test_a_place_that_may_not_be_looked_into(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    """As root, who runs these tests in CI, may look anywhere, the refusal is made here."""
+    Path("hidden/seed-0").mkdir(parents=True)
+
+    def refuse(path: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    sentence = "hidden/seed-0 cannot be read and written: Permission denied"
+    assert sentence in refused("train --task point --out hidden", capsys)
+
+
+def test_a_video_or_figures_in_a_place_that_cannot_be(capsys: pytest.CaptureFixture[str]):
+    """Told before anything is judged or measured."""
+    Path("run").mkdir()
+    Path("file").write_text("no directory")
+    about = {"config": to_json(preset("quick", "point", "m-senior")), "protocol": {}}
+    Path("run/config.json").write_text(json.dumps(about))
+    assert "file cannot be read and written: File exists" in refused("eval run --video file/a.mp4", capsys)
+    assert "file cannot be read and written: File exists" in refused("bench --json file/a.json", capsys)
 
 
 DAMAGED = {
@@ -244,7 +268,7 @@ def test_the_reward_of_meta_world_is_the_dense_one():
     [
         ("train --task door-lok", "senior: Unknown task 'door-lok'; did you mean door-lock?\n"),
         ("eval --episodes", "senior: --episodes needs a value.\n"),
-        ("resume nowhere", "senior: There is no run in nowhere: no config.json at or below it.\n"),
+        ("resume nowhere", "senior: There is no run in nowhere: no config.json of a run at or below it.\n"),
     ],
 )
 def test_the_installed_program_says_it_too(arguments: str, sentence: str):

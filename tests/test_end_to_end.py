@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from senior import checkpoint, program, runs
+from senior.checkpoint import unpack
 from senior.learner import Run
 from senior.program import Quiet, make_learner, train
 from senior.replay import Fact
@@ -27,6 +28,8 @@ def test_equal_seeds_give_equal_files_and_two_runs_in_one_program_equal_each_alo
     for seed in (0, 1):
         (alone,) = train(replace(short(), seed=seed), tmp_path / "alone")
         assert_same_run(alone.path, tmp_path / "together" / f"seed-{seed}", interrupted=False)
+        assert sorted(unpack(alone.path / "positions.npz")) == [f"step-{at:010d}" for at in (300, 600, 900, 1000)]
+        assert len(list((alone.path / "bonus").iterdir())) == 3  # none while nothing is preferred
     with pytest.raises(AssertionError):
         assert_same_run(tmp_path / "alone" / "seed-0", tmp_path / "alone" / "seed-1", interrupted=False)
 

@@ -12,8 +12,7 @@ import pytest
 from senior.checkpoint import steps, unpack
 from senior.config import Config
 from senior.envs.point import Point
-from senior.envs.vector import TRAINING, episode_seed
-from senior.evaluate import AFTERWARDS, DURING_TRAINING
+from senior.envs.vector import AFTERWARDS, EVALUATION, TRAINING, episode_seed
 from senior.program import Quiet, Result, evaluate_run, resume, train
 from senior.types import BadInput
 from tests.equal import assert_same_run, progress_of
@@ -170,7 +169,7 @@ def test_all_runs_stop_when_all_break(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_an_evaluation_that_breaks_stops_its_run(whole: list[Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    break_it(monkeypatch, Fault("nan", 45, DURING_TRAINING))
+    break_it(monkeypatch, Fault("nan", 45, EVALUATION))
     said = Said()
     good, broken = train(config(), tmp_path, seeds=2, watcher=said)
     assert_stopped(broken, 500, "the observation is nan", said)

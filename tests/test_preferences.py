@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from senior.preferences import SCHEMA_VERSION, Preferences
-from senior.types import Answers, Pairs, Preferred, Query
+from senior.types import Answers, BadInput, Pairs, Preferred, Query
 
 CAPACITY, H, O, A = 6, 4, 5, 2
 FIRST, SECOND, EQUAL = (int(label) for label in (Preferred.FIRST, Preferred.SECOND, Preferred.EQUAL))
@@ -240,5 +240,5 @@ def test_a_file_of_a_newer_schema_is_refused(opened: Opener, file: Path):
     other = sqlite3.connect(file)
     other.execute(f"PRAGMA user_version={SCHEMA_VERSION + 1}")
     other.close()
-    with pytest.raises(ValueError, match=f"version {SCHEMA_VERSION + 1}"):
+    with pytest.raises(BadInput, match=f"version {SCHEMA_VERSION + 1}"):
         opened()

@@ -67,7 +67,7 @@ def assert_goes_on_from(run: Path, saved: int, asked: int, whole: Path) -> None:
     (result,) = resume(run, watcher)
     assert result.finished
     assert_same_run(run, whole, interrupted=True)
-    assert watcher.said == []
+    assert [sentence.split(",")[0] for sentence in watcher.said] == ["Training on the CPU"]
     assert not list(run.rglob("checkpoints/*.tmp"))
 
 
@@ -204,6 +204,55 @@ def test_with_its_newest_checkpoint_damaged_a_run_goes_on_from_the_one_before(re
     assert_same_run(run, reference / "seed-0", interrupted=True)
 
 
+def test_a_run_that_cannot_go_on_is_told_and_the_others_do(reference: Path, tmp_path: Path):
+    train(short(), tmp_path, seeds=2, watcher=Stop(655))
+    for path in (tmp_path / "seed-0" / "checkpoints").glob("step-*.npz"):
+        path.write_bytes(b"PK no archive")
+    (tmp_path / "settings").mkdir()
+    (tmp_path / "settings" / "config.json").write_text("{}")  # somebody else's
+    watcher = Stop()
+    broken, good = resume(tmp_path, watcher)
+    assert broken.failure is not None and "No checkpoint in" in broken.failure
+    assert (broken.path, broken.finished) == (tmp_path / "seed-0", False)
+    assert any(sentence.endswith(broken.failure) for sentence in watcher.said)
+    assert (good.seed, good.finished) == (1, True)
+    assert_same_run(tmp_path / "seed-1", reference / "seed-1", interrupted=True)
+
+
+def test_a_run_is_trained_by_one_process_at_a_time(reference: Path, tmp_path: Path):
+    """The second is refused before it changes anything; the lock goes with the process that held it."""
+
+    class Intruder(Stop):
+        refused: subprocess.CompletedProcess[str] | None = None
+
+        def advance(self, step: int, trainees: Sequence[Trainee]) -> None:
+            if step == 300:
+                self.refused = senior(None, "resume", tmp_path)
+
+    watcher = Intruder()
+    train(short(device="cpu"), tmp_path, watcher=watcher)
+    assert watcher.refused is not None
+    assert watcher.refused.returncode == 2
+    assert watcher.refused.stderr == f"senior: The run in {tmp_path / 'seed-0'} is being trained by another process.\n"
+    assert_same_run(tmp_path / "seed-0", reference / "seed-0", interrupted=False)
+    (result,) = resume(tmp_path)
+    assert result.finished
+
+
+@pytest.mark.parametrize("moment", ["config.json", "tables"])
+def test_killed_while_its_directory_is_made(moment: str, reference: Path, tmp_path: Path):
+    """``config.json`` comes first, so there is nothing to resume, or a run that begins."""
+    run = tmp_path / "seed-0"
+    run.mkdir()
+    if moment == "tables":
+        shutil.copy(reference / "seed-0" / "config.json", run)
+        (result,) = resume(tmp_path)
+    else:
+        (result,) = train(short(device="cpu"), tmp_path)
+    assert result.finished
+    assert_same_run(run, reference / "seed-0", interrupted=False)
+
+
 def test_with_all_checkpoints_damaged_there_is_one_clear_sentence(
     reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -229,7 +278,7 @@ def test_a_run_of_another_machine_goes_on_but_says_so(reference: Path, tmp_path:
     watcher = Stop()
     (result,) = resume(run, watcher)
     assert result.finished
-    (sentence,) = watcher.said
+    sentence, _ = watcher.said
     assert sentence.startswith("seed 0: threads and packages differ from when the run began, so it goes on but")
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from senior.config import Config
+    from senior.loop import Watcher
     from senior.methods import METHODS, Method
     from senior.presets import preset
     from senior.program import Judgement, Quiet, Result, evaluate_run, resume, train
@@ -35,6 +36,7 @@ _HOME = {
     "Quiet": "program",
     "Result": "program",
     "Selection": "select",
+    "Watcher": "loop",
     "evaluate_run": "program",
     "plan": "schedule",
     "preset": "presets",
@@ -56,6 +58,7 @@ __all__ = [
     "Quiet",
     "Result",
     "Selection",
+    "Watcher",
     "evaluate_run",
     "plan",
     "preset",

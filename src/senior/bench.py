@@ -176,6 +176,9 @@ def run(method: str, preset_name: str, task: str, steps: int, runs: int, device:
         raise BadInput("--steps and --runs must be at least 1.")
     if method != "all" and method not in METHODS:
         raise BadInput.unknown("method", method, METHODS)
+    if json_file:
+        with rundir.told(json_file.parent):
+            json_file.parent.mkdir(parents=True, exist_ok=True)
     names = list(METHODS) if method == "all" else [method]
     configs = [preset(preset_name, task, name) for name in names]
     device = prepare_device(device)
@@ -206,5 +209,4 @@ def run(method: str, preset_name: str, task: str, steps: int, runs: int, device:
         "memory: the process's peak so far; relabel: a full replay of a million rows; floor: see benchmarks/README.md"
     )
     if json_file:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
         json_file.write_text(json.dumps({"machine": machine, "task": task, "figures": found}, indent=2) + "\n")

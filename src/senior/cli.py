@@ -9,7 +9,6 @@ import io
 import re
 import signal
 import sys
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -90,7 +89,6 @@ class Display:
     def __init__(self) -> None:
         self.stop = False
         self._bar: tqdm[Any] | None = None
-        self._began = time.monotonic()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._asked_to_stop)
 
@@ -193,8 +191,10 @@ def _report(results: Sequence[Any], display: Display) -> int:
     from senior import program
 
     for result in results:
-        print(f"\nseed {result.seed}: {result.path}")
-        if result.failure:
+        print(f"\n{result.path}" if result.seed is None else f"\nseed {result.seed}: {result.path}")
+        if result.seed is None:
+            print(f"  cannot go on: {result.failure}")
+        elif result.failure:
             print(f"  stopped at step {result.step}: {result.failure}")
         elif not result.finished:
             print(f"  interrupted at step {result.step}, all saved; go on with: senior resume {result.path}")

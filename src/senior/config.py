@@ -61,7 +61,7 @@ class SAC:
     tau: float = 0.005
     """Polyak step of the target critics."""
     target_every: int = 2
-    """Steps between moves of the target critics."""
+    """Updates between moves of the target critics."""
     initial_alpha: float = 0.1
     """Temperature at the start."""
     updates: int = 1
@@ -181,7 +181,7 @@ class Config:
     """One run. `senior.presets.preset` makes one; `check` refuses what makes no sense."""
 
     task: str = "door-lock"
-    """A task of `senior tasks`; ignored where --env is given."""
+    """A task of `senior tasks`. With --env it only says whose numbers the preset takes."""
     method: Annotated[Method, _FLAT] = field(default_factory=Method)
     preset: Literal["paper", "quick"] = "paper"
     """paper: the numbers of the paper. quick: see below."""
@@ -198,7 +198,7 @@ class Config:
     length_scale: float | None = None
     """The unit of both bandwidths in --env. Left out: ten times the spread of the positions seen in pre-training."""
     horizon: int | None = None
-    """Most steps of an episode of --env, where it does not tell."""
+    """Most steps of an episode; the environment's own limit, where it has one, holds too."""
     queries: Annotated[Queries, _FLAT] = field(default_factory=Queries)
     pretraining: Pretraining = field(default_factory=Pretraining)
     networks: Networks = field(default_factory=Networks)
@@ -231,7 +231,7 @@ def to_json(config: Config) -> dict[str, Any]:
 
 
 def from_json(data: dict[str, Any]) -> Config:
-    """Read a configuration. An unknown key, a missing one's wrong type: `BadInput`."""
+    """Read a configuration. `BadInput` for an unknown key or a value of the wrong type."""
     converter = cattrs.Converter(forbid_extra_keys=True)
     try:
         return converter.structure(data, Config)
@@ -281,6 +281,7 @@ def check(config: Config) -> Config:
         ("--sac.batch", config.sac.batch),
         ("--sac.updates", config.sac.updates),
         ("--sac.target-every", config.sac.target_every),
+        ("--sac.reset-updates", config.sac.reset_updates),
         ("--reward.members", config.reward.members),
         ("--reward.batch", config.reward.batch),
         ("--reward.epochs", config.reward.epochs),
@@ -299,7 +300,6 @@ def check(config: Config) -> Config:
         _require(value >= 1, f"{name} must be at least 1, not {value}.")
     for name, value in (
         ("--seed", config.seed),
-        ("--sac.reset-updates", config.sac.reset_updates),
         ("--pretraining.random-steps", config.pretraining.random_steps),
         ("--pge.beta", config.pge.beta),
         ("--bilevel.weight", config.bilevel.weight),
@@ -352,7 +352,12 @@ def check(config: Config) -> Config:
         "--pretraining.until.",
     )
     _require(
-        random_steps + config.pretraining.neighbours < until,
+        random_steps >= config.pretraining.neighbours,
+        f"State entropy looks at {config.pretraining.neighbours} neighbours, more than there are after {random_steps} "
+        "random steps; raise --pretraining.random-steps.",
+    )
+    _require(
+        random_steps + 1 < until,
         f"Pre-training must last beyond its {random_steps} random steps; raise --pretraining.until ({until}).",
     )
     _require(
@@ -361,13 +366,12 @@ def check(config: Config) -> Config:
     )
     if row.explore == "preference_guided":
         every = config.pge.every
-        for name, other in (
-            ("K, --session-every", queries.every),
-            ("N, --outer-every", config.bilevel.every),
-        ):
-            if name.startswith("K") or row.outer == "bilevel":
-                _require(
-                    other % every == 0,
-                    f"Q, --refresh-every {every}, must divide {name} {other} (the paper's Algorithm 1).",
-                )
+        others = [("K, --session-every", queries.every), ("the end of pre-training, --pretraining.until", until)]
+        if row.outer == "bilevel":
+            others.append(("N, --outer-every", config.bilevel.every))
+        for name, other in others:
+            _require(
+                other % every == 0,
+                f"Q, --refresh-every {every}, must divide {name} {other} (the paper's Algorithm 1).",
+            )
     return config

@@ -12,10 +12,6 @@ from senior.envs.vector import Environments, Failure
 Policy = Callable[[np.ndarray], np.ndarray]
 """observation [o] float32 -> action [a] in [-1, 1]."""
 
-DURING_TRAINING = 1
-AFTERWARDS = 2
-"""Purposes of episode seeds: training, evaluation within it and `senior eval` never share an episode."""
-
 
 class EpisodeFailed(Exception):
     """The environment broke during an evaluation; the text says how."""

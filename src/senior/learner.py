@@ -42,7 +42,7 @@ class Purpose(IntEnum):
 
 
 class Numbers(NamedTuple):
-    """Numeric hyper-parameters of one run, traced: runs that differ in them share one program."""
+    """Numeric hyper-parameters of one run, traced."""
 
     sac: sac.Numbers
     fit: model.FitNumbers
@@ -155,15 +155,16 @@ class Learner:
 
     def learn(self, run: Run, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
         """The ordinary updates of a step."""
-        return self._updates(run, step, Purpose.UPDATE, self.config.sac.updates)
+        times = self.config.sac.updates
+        return self._updates(run, step, _key(run, Purpose.UPDATE, step), step * times + jnp.arange(times))
 
     # Now and then.
 
     def begin(self, run: Run, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
         """The end of pre-training: new critics, then the first updates on the learned reward."""
-        agent = sac.renew_critics(run.agent, _key(run, Purpose.RENEW, step))
-        run = run._replace(agent=agent)
-        return self._updates(run, step, Purpose.RENEW, self.config.sac.reset_updates)
+        key_critics, key_updates = jax.random.split(_key(run, Purpose.RENEW, step))
+        run = run._replace(agent=sac.renew_critics(run.agent, key_critics))
+        return self._updates(run, step, key_updates, jnp.arange(self.config.sac.reset_updates))
 
     def cut(self, run: Run, starts: Int[Array, "p 2"]) -> tuple[Run, tuple[Array, Array, Array]]:
         """Observations, actions and true rewards of segments that begin at those rows of the run."""
@@ -199,9 +200,8 @@ class Learner:
         key_batch, key_value = jax.random.split(_key(run, Purpose.OUTER, step))
         batch = replay_.sample(run.replay, key_batch, self.config.sac.batch)
         separate = self.config.bilevel.optimizer == "separate"
-        fitted, info = bilevel.outer_step(
-            _some(run.model), run.agent, batch, pairs, key_value, run.numbers.outer, separate
-        )
+        numbers = run.numbers.outer._replace(inner_rate=self._decayed(run, step).critic_rate)
+        fitted, info = bilevel.outer_step(_some(run.model), run.agent, batch, pairs, key_value, numbers, separate)
         return self.relabel(run._replace(model=fitted))[0], info
 
     def measure(self, run: Run) -> tuple[Run, Float[Array, ""]]:
@@ -233,28 +233,34 @@ class Learner:
         curious = jax.tree.map(lambda column: column[rows], run.bonus.curiosity)
         return replay_.mix(batch, curious, run.bonus.ready)
 
-    def _updates(self, run: Run, step: Array, purpose: Purpose, times: int) -> tuple[Run, dict[str, Array]]:
-        key, now = _key(run, purpose, step), self._now(run, step)
-        along = jnp.clip((step - run.numbers.until) / (run.numbers.steps - run.numbers.until), 0, 1)
-        rate = 1 + (run.numbers.rate_end - 1) * along
-        numbers = run.numbers.sac._replace(
-            actor_rate=run.numbers.sac.actor_rate * rate, critic_rate=run.numbers.sac.critic_rate * rate
+    def _decayed(self, run: Run, step: Array) -> sac.Numbers:
+        """SAC's numbers at a step: actor's and critics' rates on their straight line."""
+        numbers = run.numbers
+        along = jnp.clip((step - numbers.until) / (numbers.steps - numbers.until), 0, 1)
+        factor = 1 + (numbers.rate_end - 1) * along
+        return numbers.sac._replace(
+            actor_rate=numbers.sac.actor_rate * factor, critic_rate=numbers.sac.critic_rate * factor
         )
 
-        def one(agent: sac.Agent, i: Array | int) -> tuple[sac.Agent, dict[str, Array]]:
-            key_batch, key_update = jax.random.split(jax.random.fold_in(key, i))
+    def _updates(
+        self, run: Run, step: Array, key: PRNGKeyArray, count: Int[Array, " n"]
+    ) -> tuple[Run, dict[str, Array]]:
+        """Updates one after the other; ``count`` numbers them, which decides whether the targets move."""
+        now, numbers = self._now(run, step), self._decayed(run, step)
+
+        def one(agent: sac.Agent, nth: Array) -> tuple[sac.Agent, dict[str, Array]]:
+            key_batch, key_update = jax.random.split(jax.random.fold_in(key, nth))
             batch = self._draw(run, key_batch)
             paid = self.bonus.value(run.bonus, batch, now)
             reward = batch.learned_reward + paid if self.config.method.learns_reward else batch.reward
-            nth = i if purpose is Purpose.RENEW else step * times + i
             move = nth % self.config.sac.target_every == 0
             agent, info = sac.update(agent, batch, reward, key_update, numbers, move)
             return agent, {**info, "bonus_mean": paid.mean(), "batch_reward": reward.mean()}
 
-        if times == 1:
-            agent, info = one(run.agent, 0)
+        if len(count) == 1:
+            agent, info = one(run.agent, count[0])
         else:
-            agent, infos = jax.lax.scan(one, run.agent, jnp.arange(times))
+            agent, infos = jax.lax.scan(one, run.agent, count)
             info = jax.tree.map(lambda values: values[-1], infos)
         return run._replace(agent=agent), info
 

@@ -170,7 +170,8 @@ class Training:
         until = self.trainees[0].config.pretraining.until
         function = learner.store_pretraining if step < until else learner.store
         returns = self.runs.every(function, self.mask(), facts)
-        for i, one in enumerate(happened):
+        for i in self.active():
+            one = happened[i]
             if one is not None:
                 self.trainees[i].record(
                     step, one, returns[i] if one.ended else None, info[i] if one.ended and info else None
@@ -187,6 +188,8 @@ class Training:
             progress.measured = True
         if plan.session:
             self.session(i, step, plan.session)
+            if trainee.failure:
+                return
         if plan.outer and progress.labels:
             info = self.runs.one(i, learner.outer, trainee.latest_pairs(), at)
             progress.outer_steps += 1
@@ -195,7 +198,7 @@ class Training:
             report = {name: float(value) for name, value in self.runs.one(i, learner.refresh, at).items()}
             progress.refreshes += 1
             progress.latest.update({name: report[name] for name in ("beta", "intrinsic_mean") if name in report})
-            if "beta" in report:
+            if {"beta", "intrinsic_mean"} <= report.keys():
                 self.warn(i, "bonus", health.bonus_zero(report["beta"], report["intrinsic_mean"]))
         if plan.begin:
             self.runs.one(i, learner.begin, at)
@@ -234,12 +237,22 @@ class Training:
         ids = preferences.add(query, progress.sessions, step, trainee.config.seed, sides)
         trainee.teacher.ask(ids, query)
         answers = trainee.teacher.collect()
+        if sorted(answers.ids) != ids or not set(answers.labels) <= {None, *map(int, Preferred)}:
+            preferences.truncate(ids[0] - 1)
+            self.fail(
+                i,
+                step,
+                f"The teacher {trainee.config.teacher} must answer every pair at once, by first (0), "
+                "second (1), equal (-1) or a skip (None).",
+            )
+            return
         preferences.answer(answers, trainee.config.teacher, step)
         progress.sessions += 1
         progress.queried += n
         progress.labels = preferences.arrays.count
 
-        self.judge_predictions(i, query, answers.labels)
+        said = dict(zip(answers.ids, answers.labels, strict=True))
+        self.judge_predictions(i, query, [said[number] for number in ids])
         if not progress.labels:
             return
         at = np.int32(step)
@@ -276,9 +289,10 @@ class Training:
             with self.clock.part("evaluate"):
                 if not self.evaluate(i, step):
                     return
-            if step % config.snapshot_every == 0 or at_end:
-                self.snapshot(i, step)
             trainee.directory.append("timing.csv", self.clock.row(step))
+        if step > progress.snapped and (step % config.snapshot_every == 0 or at_end):
+            self.snapshot(i, step)
+            progress.snapped = step
         if step > progress.step and (step % config.checkpoint_every == 0 or last):
             with self.clock.part("checkpoint"):
                 trainee.save(self.runs[i], step)

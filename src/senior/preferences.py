@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from senior.types import Answers, Pairs, Preferred, Query
+from senior.types import Answers, BadInput, Pairs, Preferred, Query
 
 SCHEMA_VERSION = 1
 _SCHEMA = """
@@ -38,7 +38,7 @@ CREATE TABLE pairs (
     answered_step INTEGER,              -- environment step at which the answer was collected
     shown_left    INTEGER NOT NULL      -- 0 or 1: which segment was shown on the left
 );
-CREATE TABLE shape (steps INTEGER, observation INTEGER, action INTEGER);
+CREATE TABLE shape (steps INTEGER, observation INTEGER, action INTEGER);  -- of every segment: H, o, a
 """
 
 
@@ -54,8 +54,8 @@ class LabelledArrays(NamedTuple):
 class Preferences:
     """The file of one run, opened for reading and writing.
 
-    ``capacity`` is the budget: no label is ever dropped. Opening creates the file; a file of another schema
-    version is a `ValueError`.
+    ``capacity`` is the budget: no label is ever dropped. Opening creates the file; one that cannot be read, or is of
+    another schema version, is a `BadInput`.
     """
 
     def __init__(self, path: Path, capacity: int, segment: int, observation_size: int, action_size: int) -> None:
@@ -66,16 +66,21 @@ class Preferences:
             0,
         )
         self._shape = (segment, observation_size, action_size)
-        self._db = sqlite3.connect(path)
+        try:
+            self._db = sqlite3.connect(path)
+            self._open(path)
+        except sqlite3.Error as error:
+            raise BadInput(f"{path} cannot be used: {error}.") from error
+
+    def _open(self, path: Path) -> None:
         self._db.execute("PRAGMA journal_mode=WAL")
         self._db.execute("PRAGMA synchronous=FULL")
         version = self._db.execute("PRAGMA user_version").fetchone()[0]
         if version == 0:
-            self._db.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version={SCHEMA_VERSION}; COMMIT;")
-            with self._db:
-                self._db.execute("INSERT INTO shape VALUES (?, ?, ?)", self._shape)
+            row = "INSERT INTO shape VALUES ({:d}, {:d}, {:d});".format(*self._shape)
+            self._db.executescript(f"BEGIN; {_SCHEMA} {row} PRAGMA user_version={SCHEMA_VERSION}; COMMIT;")
         elif version != SCHEMA_VERSION:
-            raise ValueError(f"{path} has schema version {version}; this program reads {SCHEMA_VERSION}.")
+            raise BadInput(f"{path} has schema version {version}; this program reads {SCHEMA_VERSION}.")
         self._read()
 
     def close(self) -> None:

@@ -16,8 +16,8 @@ from senior.agent.networks import MLP
 from senior.checkpoint import Damaged, unpack
 from senior.config import Config, check, load
 from senior.envs import render
-from senior.envs.vector import Environments, episode_seed
-from senior.learner import Learner, mean_action
+from senior.envs.vector import AFTERWARDS, Environments, episode_seed
+from senior.learner import Learner, Run, mean_action
 from senior.loop import Training, Watcher
 from senior.report.curves import learning_curve
 from senior.runs import Lift, Runs, lift_for, prepare_device
@@ -26,7 +26,7 @@ from senior.types import BadInput, EnvSpec
 
 
 class Quiet:
-    """A watcher that prints warnings and nothing else, and never says stop."""
+    """A watcher that prints what is said and nothing else, and never says stop."""
 
     stop = False
 
@@ -42,10 +42,13 @@ class Result:
     """What came of one run."""
 
     path: Path
-    seed: int
+    seed: int | None
+    """None if the run could not be opened."""
     step: int
+    """Environment steps taken."""
     finished: bool
     failure: str | None
+    """Why the run was stopped, in a sentence."""
     labels: int
     success_rate: float | None
     """Of the last evaluation, in [0, 1]; None if the environment tells no success or nothing was evaluated."""
@@ -60,6 +63,9 @@ def train(
 ) -> list[Result]:
     """Train ``seeds`` runs (seeds ``config.seed``, +1, ...) in one program, each in ``out/seed-N``.
 
+    watcher: who is told of every step and of warnings, and can stop the runs, all saved; None prints warnings.
+    lift: how the runs share the program, ``loop`` or ``vmap``; None takes what suits the device.
+
     Returns one `Result` per run. Raises `BadInput` before anything is written if the configuration makes no
     sense, the environment does not fit, or a directory is not empty.
     """
@@ -67,6 +73,7 @@ def train(
         raise BadInput(f"--seeds must be at least 1, not {seeds}.")
     check(config)
     check(replace(config, seed=config.seed + seeds - 1))
+    watcher = watcher or Quiet()
     device = prepare_device(config.device)
     config = replace(config, device=device)
     learner = make_learner(config)
@@ -87,32 +94,34 @@ def train(
     for trainee in trainees:
         trainee.directory.check_free()
         trainee.reset(0)
+    protocol = rundir.protocol(learner.spec, device)
     for trainee in trainees:
-        trainee.directory.create(trainee.config, rundir.protocol(learner.spec, device))
+        trainee.directory.create(trainee.config, protocol)
+    _announce(device, watcher)
     runs = Runs([trainee.begin() for trainee in trainees], lift or lift_for(device))
-    return _run(trainees, runs, watcher or Quiet())
+    return _run(trainees, runs, watcher)
 
 
 def resume(path: Path | str, watcher: Watcher | None = None) -> list[Result]:
     """Continue an interrupted run, or every run under a directory that is not finished.
 
-    Runs that stand at the same step go on in one program. Raises `BadInput` if there is no run.
+    Runs that stand at the same step go on in one program. One that cannot go on is told, and the others do. Raises
+    `BadInput` if there is no run, or the only one cannot go on.
     """
     watcher = watcher or Quiet()
-    waiting: list[tuple[Trainee, object]] = []
-    for directory in find_runs(path):
-        config = load(directory / "config.json")
-        device = prepare_device(config.device)
-        learner = make_learner(config)
-        trainee = Trainee(config, directory, learner)
-        _compare_protocol(trainee, device, watcher)
+    waiting: list[tuple[Trainee, Run]] = []
+    results: list[Result] = []
+    found = find_runs(path)
+    for directory in found:
         try:
-            waiting.append((trainee, trainee.resume(watcher.say)))
-        except BadInput:
-            for opened in (trainee, *(other for other, _ in waiting)):
-                opened.close()
-            raise
-    results = []
+            waiting.append(_reopen(directory, watcher))
+        except BadInput as error:
+            if len(found) == 1:
+                raise
+            watcher.say(f"{directory}: {error}")
+            results.append(Result(directory, None, 0, False, str(error), 0, None))
+    if waiting:
+        _announce(waiting[0][0].config.device, watcher)
     while waiting:
         first = waiting[0][0]
         together = [
@@ -125,7 +134,7 @@ def resume(path: Path | str, watcher: Watcher | None = None) -> list[Result]:
         trainees = [trainee for trainee, _ in together]
         for trainee in trainees:
             trainee.learner = first.learner
-        runs = Runs([run for _, run in together], lift_for(first.config.device))  # pyright: ignore[reportArgumentType]
+        runs = Runs([run for _, run in together], lift_for(first.config.device))
         results += _run(trainees, runs, watcher)
         if watcher.stop:
             for trainee, _ in waiting:
@@ -134,30 +143,56 @@ def resume(path: Path | str, watcher: Watcher | None = None) -> list[Result]:
     return results
 
 
+def _announce(device: str, watcher: Watcher) -> None:
+    watcher.say(f"Training on the {device.upper()}, {rundir.threads()} threads.")
+
+
+def _reopen(directory: Path, watcher: Watcher) -> tuple[Trainee, Run]:
+    config = load(directory / "config.json")
+    device = prepare_device(config.device)
+    trainee = Trainee(config, directory, make_learner(config))
+    _compare_protocol(trainee, device, watcher)
+    try:
+        return trainee, trainee.resume(watcher.say)
+    except BadInput:
+        trainee.close()
+        raise
+
+
 @dataclass(frozen=True)
 class Judgement:
     """`evaluate_run`'s finding."""
 
     episodes: int
     success_rate: float | None
+    """In [0, 1]: episodes with success at any step. None if the environment tells no success."""
     return_mean: float
+    """True return, a sum over an episode."""
     return_std: float
+    """Its population standard deviation."""
     step: int
+    """When the policy was saved."""
     video: Path | None
     no_video: str | None
     """Why there is no video, in a sentence."""
 
 
 def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None = None) -> Judgement:
-    """Judge a run's policy, as last saved, on fresh episodes that training never saw; film the first one if asked."""
+    """Judge a run's policy, as last saved, on fresh episodes that training never saw; film the first one if asked.
+
+    Raises `BadInput` if there is no such run or no policy yet, ``video`` cannot be written, or the environment fails.
+    """
     if episodes < 1:
         raise BadInput(f"--episodes must be at least 1, not {episodes}.")
     path = Path(path)
     config = load(path / "config.json")
-    prepare_device("cpu")
+    if video is not None:
+        with rundir.told(Path(video).parent):
+            Path(video).parent.mkdir(parents=True, exist_ok=True)
+    prepare_device("auto")
     step, actor = load_policy(path)
     policy = jax.jit(mean_action)
-    environment = Environments(lambda: make_environment(config), [config.seed], evaluate.AFTERWARDS)
+    environment = Environments(lambda: make_environment(config), [config.seed], AFTERWARDS)
     try:
         judged = evaluate.judge(
             lambda observation: np.asarray(policy(actor, observation)), environment, range(episodes)
@@ -169,7 +204,7 @@ def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None 
     summary = evaluate.summary(judged)
     reason = None
     if video is not None:
-        reason = film(config, evaluate.AFTERWARDS, 0, judged[0].actions, Path(video))
+        reason = film(config, AFTERWARDS, 0, judged[0].actions, Path(video))
     return Judgement(
         episodes,
         summary["success_rate"],
@@ -183,7 +218,10 @@ def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None 
 
 def film_policy(path: Path, out: Path) -> str | None:
     """Film one fresh episode of a run's policy; None, or the sentence why there is no video."""
-    return evaluate_run(path, episodes=1, video=out).no_video
+    try:
+        return evaluate_run(path, episodes=1, video=out).no_video
+    except BadInput as error:
+        return str(error)
 
 
 def load_policy(path: Path) -> tuple[int, MLP]:
@@ -214,18 +252,18 @@ def film(config: Config, purpose: int, episode: int, actions: np.ndarray, out: P
         length_scale=config.length_scale,
         horizon=config.horizon,
     )
-    out.parent.mkdir(parents=True, exist_ok=True)
     return render.record(request, out)
 
 
 def find_runs(path: Path | str) -> list[Path]:
     """The run directories at or under a path, in order; `BadInput` if there is none."""
     path = Path(path)
-    if (path / "config.json").is_file():
-        return [path]
-    found = sorted(file.parent for file in path.glob("**/config.json"))
+    with rundir.told(path):
+        if (path / "config.json").is_file():
+            return [path]
+        found = sorted(file.parent for file in path.glob("**/config.json") if rundir.is_run(file.parent))
     if not found:
-        raise BadInput(f"There is no run in {path}: no config.json at or below it.")
+        raise BadInput(f"There is no run in {path}: no config.json of a run at or below it.")
     return found
 
 

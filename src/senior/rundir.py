@@ -14,7 +14,8 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,13 @@ from tensorboardX import SummaryWriter
 
 from senior.checkpoint import Damaged, pack, unpack, write_atomically
 from senior.config import Config, to_json
+from senior.envs import metaworld
 from senior.types import BadInput, EnvSpec
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 EVAL = ("step", "labels", "queried", "episodes", "success_rate", "return_mean", "return_std")
 TRAIN = (
@@ -65,8 +72,7 @@ TIMING = (
     "checkpoint",
 )
 TABLES = {"eval.csv": EVAL, "train.csv": TRAIN, "timing.csv": TIMING}
-PACKAGES = ("senior-rl", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "metaworld", "mujoco")
-REWARD_VERSION = "v2"
+PACKAGES = ("senior-rl", "jax", "jaxlib", "optax", "numpy", "gymnasium", "metaworld", "mujoco")
 
 
 class RunDirectory:
@@ -76,6 +82,7 @@ class RunDirectory:
         self.path = path
         self.checkpoints = path / "checkpoints"
         self._board: SummaryWriter | None = None
+        self._lock: int | None = None
 
     @property
     def preferences(self) -> Path:
@@ -83,21 +90,35 @@ class RunDirectory:
 
     def check_free(self) -> None:
         """`BadInput` if there is something in its place."""
-        if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+        with told(self.path):
+            taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
+        if taken:
             raise BadInput(f"{self.path} exists and is not empty; choose another --out, or resume the run in it.")
 
     def create(self, config: Config, protocol: Mapping[str, Any]) -> None:
-        """A new directory; `BadInput` if there is something in its place or it cannot be written."""
+        """A new directory; `BadInput` if there is something in its place or it cannot be written.
+
+        ``config.json`` comes first: what is killed after it can be resumed.
+        """
         self.check_free()
-        try:
+        with told(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
-            for name, columns in TABLES.items():
-                (self.path / name).write_text(",".join(columns) + "\n")
-            (self.path / "warnings.log").touch()
+            self.lock()
             content = {"config": to_json(config), "protocol": dict(protocol)}
             write_atomically(self.path / "config.json", (json.dumps(content, indent=2) + "\n").encode())
-        except OSError as error:
-            raise BadInput(f"{self.path} cannot be written: {error.strerror}.") from error
+
+    def lock(self) -> None:
+        """Keep other processes from training the same run; the lock goes with the process. `BadInput` if one does."""
+        if fcntl is None or self._lock is not None:
+            return
+        self._lock = os.open(self.path, os.O_RDONLY)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.close()
+            raise BadInput(f"The run in {self.path} is being trained by another process.") from None
+        except OSError:  # a file system without locks
+            pass
 
     def append(self, table: str, row: Mapping[str, Any]) -> None:
         """One row; numbers that are missing or None stay empty."""
@@ -130,12 +151,16 @@ class RunDirectory:
     def truncate(self, lengths: Mapping[str, int], step: int) -> None:
         """Cut the append-only files back to a checkpoint's lengths and forget snapshots after its step."""
         for name, columns in TABLES.items():
-            os.truncate(self.path / name, lengths.get(name, len(",".join(columns)) + 1))
+            head = ",".join(columns) + "\n"
+            if name not in lengths:
+                (self.path / name).write_text(head)
+            os.truncate(self.path / name, lengths.get(name, len(head)))
+        (self.path / "warnings.log").touch()
         os.truncate(self.path / "warnings.log", lengths.get("warnings.log", 0))
         for path in (self.path / "bonus").glob("step-*.npz"):
             if int(path.stem.removeprefix("step-")) > step:
                 path.unlink()
-        self._board = SummaryWriter(str(self.path / "tensorboard"), purge_step=step)
+        self._board = SummaryWriter(str(self.path / "tensorboard"), purge_step=step + 1)
 
     def snapshot(self, step: int, positions: np.ndarray, bonus: Mapping[str, np.ndarray]) -> None:
         """Add visited positions ``[n, d]`` to ``positions.npz``; what is behind f_P and f_E goes to ``bonus/``."""
@@ -156,20 +181,42 @@ class RunDirectory:
         write_atomically(self.path / "policy" / "actor.npz", pack(dict(actor)))
 
     def forget_everything(self) -> None:
-        """Back to the beginning, for a run that was interrupted before its first checkpoint."""
+        """Empty tables and nothing else: the beginning of a run, or of one killed before its first checkpoint."""
         self.truncate({}, -1)
         (self.path / "positions.npz").unlink(missing_ok=True)
         for name in ("checkpoints", "bonus", "policy"):
             shutil.rmtree(self.path / name, ignore_errors=True)
 
     def close(self) -> None:
+        """Close the files and let go of the lock."""
         if self._board is not None:
             self._board.close()
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def _tensorboard(self) -> SummaryWriter:
         if self._board is None:
             self._board = SummaryWriter(str(self.path / "tensorboard"))
         return self._board
+
+
+@contextmanager
+def told(path: Path) -> Iterator[None]:
+    """Whatever the file system refuses there becomes a sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise BadInput(f"{path} cannot be read and written: {error.strerror or error}.") from error
+
+
+def is_run(path: Path) -> bool:
+    """Whether the ``config.json`` there is one of ours. One that is damaged may be, and is told when it is read."""
+    try:
+        content = json.loads((path / "config.json").read_text())
+    except ValueError:
+        return True
+    return isinstance(content, dict) and {"config", "protocol"} <= content.keys()
 
 
 def read_protocol(path: Path) -> dict[str, Any]:
@@ -181,7 +228,7 @@ def protocol(spec: EnvSpec, device: str) -> dict[str, Any]:
     """What a number of this run depends on beside its configuration."""
     return {
         "environment": spec.name,
-        "reward_version": REWARD_VERSION,
+        "reward_version": metaworld.REWARD_FUNCTION_VERSION if spec.name in metaworld.TASKS else None,
         "horizon": spec.horizon,
         "observation_size": spec.observation_size,
         "action_size": spec.action_size,

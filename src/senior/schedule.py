@@ -27,7 +27,7 @@ class Due(NamedTuple):
 def due(config: Config, step: int, queried: int) -> Due:
     """What is due at ``step`` for a run that has asked ``queried`` pairs.
 
-    A session that was put off for lack of episodes is due again at the next multiple of K.
+    A session that was put off for lack of episodes is due again K steps later.
     """
     until, random_steps = config.pretraining.until, config.pretraining.random_steps
     random = step < random_steps

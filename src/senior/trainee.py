@@ -11,13 +11,12 @@ import numpy as np
 
 from senior import checkpoint, envs, parts
 from senior.config import Config
-from senior.envs.vector import TRAINING, Environments, Failure, Step
-from senior.evaluate import DURING_TRAINING
+from senior.envs.vector import EVALUATION, TRAINING, Environments, Failure, Step
 from senior.learner import Learner, Purpose, Run
 from senior.preferences import Preferences
 from senior.reward.bilevel import FirstSteps
 from senior.reward.model import Labelled
-from senior.rundir import RunDirectory
+from senior.rundir import RunDirectory, told
 from senior.types import BadInput, EnvSpec
 
 
@@ -27,6 +26,7 @@ class Progress:
 
     step: int = 0
     evaluated: int = 0  # the step of the last evaluation
+    snapped: int = 0  # and of the last snapshot
     written: int = 0  # facts that are in chunks on the disk
     last_pair: int = 0  # number of the last row of the preference file
     queried: int = 0
@@ -69,7 +69,7 @@ class Trainee:
         self.progress = Progress()
         self.failure: str | None = None
         self.environment = Environments(lambda: make_environment(config), [config.seed], TRAINING)
-        self.judged_in = Environments(lambda: make_environment(config), [config.seed], DURING_TRAINING)
+        self.judged_in = Environments(lambda: make_environment(config), [config.seed], EVALUATION)
         self.rule = parts.selection(config) if config.method.learns_reward else None
         self.teacher = parts.teacher(config)
         self._preferences: Preferences | None = None
@@ -99,7 +99,8 @@ class Trainee:
     # Beginning, saving, resuming.
 
     def begin(self) -> Run:
-        """A new run in a new directory, whose environment stands at its first step (`reset`)."""
+        """A new run in a directory made for it, whose environment stands at its first step (`reset`)."""
+        self.directory.forget_everything()
         self._open_preferences(0)
         return self.learner.init(self.config.seed)
 
@@ -110,12 +111,19 @@ class Trainee:
             raise BadInput(failed.message)
 
     def resume(self, tell: Callable[[str], None]) -> Run:
-        """The newest checkpoint that can be read, or the beginning if there is none yet."""
+        """The newest checkpoint that can be read, or the beginning if there is none yet.
+
+        Raises `BadInput` if another process trains this run, or its directory cannot be used.
+        """
+        with told(self.directory.path):
+            self.directory.lock()
+            return self._resume(tell)
+
+    def _resume(self, tell: Callable[[str], None]) -> Run:
         found = checkpoint.newest(self.directory.checkpoints, lambda: self.learner.init(self.config.seed), tell)
         if found is None:
             if any(self.directory.checkpoints.glob("step-*.npz")):
                 raise BadInput(f"No checkpoint in {self.directory.path} can be read; the run cannot be resumed.")
-            self.directory.forget_everything()
             self.reset(0)
             return self.begin()
         step, run, progress = found

@@ -32,7 +32,7 @@ class Agent(NamedTuple):
 
 
 class Numbers(NamedTuple):
-    """Numeric hyper-parameters, traced so that runs which differ in them share one program."""
+    """Numeric hyper-parameters, traced."""
 
     actor_rate: Float[Array, ""] | float
     critic_rate: Float[Array, ""] | float

@@ -19,6 +19,8 @@ from senior.types import EnvSpec
 
 TRAINING = 0
 EVALUATION = 1
+AFTERWARDS = 2
+"""Purposes of episodes: training, evaluation within it and `senior eval` never share one."""
 
 
 class Step(NamedTuple):
@@ -47,7 +49,7 @@ class Failure:
 def episode_seed(run_seed: int, purpose: int, episode: int) -> int:
     """The seed of one episode, in [0, 2^31): the range that every kind of environment accepts.
 
-    run_seed, episode: at least 0. purpose: `TRAINING` or `EVALUATION`.
+    run_seed, episode: at least 0. purpose: `TRAINING`, `EVALUATION` or `AFTERWARDS`.
     """
     words = np.random.SeedSequence([run_seed, purpose, episode]).generate_state(1)
     return int(words[0]) >> 1
@@ -67,7 +69,7 @@ class Environments:
         seeds: Sequence[int],
         purpose: int,
     ) -> None:
-        """``make``: called once per run. ``seeds``: the runs'. ``purpose``: `TRAINING` or `EVALUATION`."""
+        """``make``: called once per run. ``seeds``: the runs'. ``purpose``: what the episodes are for."""
         built = [make() for _ in seeds]
         self.make = make
         self.seeds = list(seeds)

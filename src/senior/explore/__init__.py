@@ -51,5 +51,5 @@ class Bonus(Protocol):
         ...
 
     def report(self, state: Any) -> dict[str, Array]:
-        """Numbers for the log, for instance ``beta``."""
+        """Numbers for the log: ``beta``, its weight, and ``intrinsic_mean``, what it weighs; or nothing."""
         ...

@@ -33,7 +33,7 @@ class FirstSteps(NamedTuple):
 class OuterNumbers(NamedTuple):
     """Numeric settings of the outer step, traced."""
 
-    inner_rate: Float[Array, ""] | float  # the critics' learning rate
+    inner_rate: Float[Array, ""] | float  # the critics' learning rate at that step
     rate: Float[Array, ""] | float
     weight: Float[Array, ""] | float
     discount: Float[Array, ""] | float

@@ -1,4 +1,4 @@
-"""Who answers. A teacher is asked pairs and may answer later: ``ask`` and ``collect`` are two calls.
+"""Who answers. ``ask`` and ``collect`` are two calls, for people take their time; as yet, all must answer at once.
 
 A scripted teacher is a new file here and a line in `TEACHERS`; a third party's is named ``module:Name``.
 """
@@ -20,5 +20,5 @@ class Teacher(Protocol):
         ...
 
     def collect(self) -> Answers:
-        """Answers that have come in since the last call, perhaps none yet."""
+        """One answer to every pair asked since the last call."""
         ...
