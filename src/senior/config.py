@@ -54,8 +54,8 @@ class SAC:
     alpha_rate: float = 1e-4
     """Adam's learning rate for the temperature."""
     rate_end: float = 1.0
-    """Factor on the actor's and critics' learning rates at the last step, reached along a straight line over the last
-    quarter of the run. 1: constant, as in the papers."""
+    """Factor on the actor's and critics' learning rates at the last step, reached along a straight line from the end
+    of pre-training. 1: constant, as in the papers."""
     discount: float = 0.99
     """Discount gamma."""
     tau: float = 0.005

@@ -234,9 +234,9 @@ class Learner:
         return replay_.mix(batch, curious, run.bonus.ready)
 
     def _decayed(self, run: Run, step: Array) -> sac.Numbers:
-        """SAC's numbers at a step: over the last quarter of the run, actor's and critics' rates go to their end."""
+        """SAC's numbers at a step: actor's and critics' rates on their straight line."""
         numbers = run.numbers
-        along = jnp.clip(4 * step / numbers.steps - 3, 0, 1)
+        along = jnp.clip((step - numbers.until) / (numbers.steps - numbers.until), 0, 1)
         factor = 1 + (numbers.rate_end - 1) * along
         return numbers.sac._replace(
             actor_rate=numbers.sac.actor_rate * factor, critic_rate=numbers.sac.critic_rate * factor

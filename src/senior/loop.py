@@ -227,7 +227,8 @@ class Training:
         def predict(observation: np.ndarray, action: np.ndarray) -> np.ndarray:
             return np.asarray(runs.one(i, learner.summed_rewards, observation, action))
 
-        rule = trainee.rule if progress.sessions and trainee.rule else parts.first_selection()
+        informed = progress.labels > 0
+        rule = trainee.rule if informed and trainee.rule else parts.first_selection()
         context = Context(pool, predict, trainee.spec, length_scale)
         chosen = rule(trainee.rng(Purpose.SELECT, step), context, n)
         before = predict(pool.observation, pool.action).mean(axis=0)[chosen.index]
@@ -252,7 +253,7 @@ class Training:
         progress.labels = preferences.arrays.count
 
         said = dict(zip(answers.ids, answers.labels, strict=True))
-        self.judge_predictions(i, query, [said[number] for number in ids])
+        self.judge_predictions(i, query, [said[number] for number in ids], informed)
         if not progress.labels:
             return
         at = np.int32(step)
@@ -261,8 +262,11 @@ class Training:
         positions, count = preferences.preferred_positions(trainee.spec.position)
         runs.one(i, learner.on_session, positions, np.int32(count), at)
 
-    def judge_predictions(self, i: int, query: Query, labels: Sequence[int | None]) -> None:
-        """Prospective accuracy: the model's prediction of new pairs before it is fitted to them."""
+    def judge_predictions(self, i: int, query: Query, labels: Sequence[int | None], informed: bool) -> None:
+        """Prospective accuracy: the model's prediction of new pairs before it is fitted to them.
+
+        ``informed``: it had been fitted to some before.
+        """
         progress = self.trainees[i].progress
         assert query.prediction is not None
         decided = [
@@ -273,7 +277,7 @@ class Training:
         if not decided:
             return
         progress.latest["reward_accuracy"] = sum(decided) / len(decided)
-        if progress.sessions > 1:  # the model of the first session has learned nothing yet
+        if informed:
             progress.right.append(int(sum(decided)))
             progress.decided.append(len(decided))
             self.warn(i, "accuracy", health.accuracy_at_chance(progress.right, progress.decided))

@@ -42,7 +42,7 @@ def selection(config: Config) -> Rule:
 
 
 def first_selection() -> Rule:
-    """The rule of every first session, whatever the scheme: nothing is known yet."""
+    """The rule of every session before the first label, whatever the scheme: nothing is known yet."""
     return load("uniform", RULES, "selection rule")
 
 

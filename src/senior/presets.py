@@ -74,15 +74,7 @@ def quick(task: str, row: Method) -> Config:
         preset="quick",
         steps=80_000,
         networks=small,
-        sac=SAC(
-            batch=128,
-            actor_rate=1e-3,
-            critic_rate=1e-3,
-            alpha_rate=3e-4,
-            target_entropy=-0.5,
-            rate_end=0.0,
-            updates=2,
-        ),
+        sac=SAC(batch=128, critic_rate=1e-3, alpha_rate=3e-4, rate_end=0.0, updates=2),
         snapshot_every=10_000,
         evaluation=Evaluation(every=5000),
     )
@@ -91,7 +83,7 @@ def quick(task: str, row: Method) -> Config:
     return replace(
         config,
         pretraining=Pretraining(until=20_000),
-        queries=replace(config.queries, budget=250, per_session=25, every=3500),
+        queries=replace(config.queries, budget=250, per_session=25, every=2500),
         reward=Reward(epochs=50),
         mds=MotionDistinction(keep=1.0),
         pge=replace(config.pge, every=500),
