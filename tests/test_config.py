@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from senior import envs
+from senior import bench, envs
 from senior.config import SAC, Config, Queries, check, differences, from_json, load, to_json
 from senior.methods import METHODS, Method
 from senior.presets import PRESETS, preset, quick_changes
@@ -24,6 +24,14 @@ def test_every_preset_makes_sense_and_survives_json(name: str, task: str, row: s
     assert check(config) is config
     assert (config.preset, config.task, config.method) == (name, task, METHODS[row])
     assert from_json(json.loads(json.dumps(to_json(config)))) == config
+
+
+@pytest.mark.parametrize(("name", "task", "row"), EVERYTHING)
+def test_what_the_bench_makes_of_every_preset_makes_sense_too(name: str, task: str, row: str):
+    config = preset(name, task, row)
+    hastened = bench.hastened(config)
+    assert hastened.pretraining.until == (2000 if config.method.learns_reward else 0)
+    assert (hastened.networks, hastened.sac) == (config.networks, config.sac)
 
 
 def test_the_readme_tells_what_quick_changes():

@@ -32,6 +32,7 @@ from senior.trainee import Trainee
 from senior.types import BadInput
 
 PARTS = ("act", "environment", "update", "store")
+WARM_UP = 100
 
 
 @dataclass
@@ -92,21 +93,26 @@ def product_rate(size: int) -> float:
     return 2 * 4096 * size * size / best
 
 
-def measure(config: Config, runs: int, device: str, length: int, out: Path) -> dict[str, Any]:
-    """Figures of one method; ``length`` main-phase steps are timed twice, with and without waiting per part."""
-    until, warm = 1500, 100
-    learns = config.method.learns_reward
-    start = (until if learns else 5000 if config.preset == "paper" else 1000) + warm
-    config = check(
+def hastened(config: Config) -> Config:
+    """A million steps with a short pre-training, and nothing written on the way."""
+    pretraining = Pretraining(random_steps=1000, until=2000) if config.method.learns_reward else config.pretraining
+    return check(
         replace(
             config,
-            pretraining=Pretraining(random_steps=1000, until=until) if learns else config.pretraining,
+            pretraining=pretraining,
             steps=1_000_000,
             evaluation=replace(config.evaluation, every=10**9),
             checkpoint_every=10**9,
             snapshot_every=10**9,
         )
     )
+
+
+def measure(config: Config, runs: int, device: str, length: int, out: Path) -> dict[str, Any]:
+    """Figures of one method; ``length`` main-phase steps are timed twice, with and without waiting per part."""
+    config = hastened(config)
+    learns = config.method.learns_reward
+    start = max(config.pretraining.until, config.pretraining.random_steps) + WARM_UP
     began = time.perf_counter()
     learner = program.make_learner(config)
     trainees = [Trainee(replace(config, seed=i), out / f"seed-{i}", learner) for i in range(runs)]
