@@ -183,8 +183,7 @@ def run(method: str, preset_name: str, task: str, steps: int, runs: int, device:
     if method != "all" and method not in METHODS:
         raise BadInput.unknown("method", method, METHODS)
     if json_file:
-        with rundir.told(json_file.parent):
-            json_file.parent.mkdir(parents=True, exist_ok=True)
+        rundir.make_room(json_file)
     names = list(METHODS) if method == "all" else [method]
     configs = [preset(preset_name, task, name) for name in names]
     device = prepare_device(device)

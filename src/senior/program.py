@@ -187,8 +187,7 @@ def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None 
     path = Path(path)
     config = load(path / "config.json")
     if video is not None:
-        with rundir.told(Path(video).parent):
-            Path(video).parent.mkdir(parents=True, exist_ok=True)
+        rundir.make_room(Path(video))
     prepare_device("auto")
     step, actor = load_policy(path)
     policy = jax.jit(mean_action)

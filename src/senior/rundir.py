@@ -151,10 +151,10 @@ class RunDirectory:
     def truncate(self, lengths: Mapping[str, int], step: int) -> None:
         """Cut the append-only files back to a checkpoint's lengths and forget snapshots after its step."""
         for name, columns in TABLES.items():
-            head = ",".join(columns) + "\n"
-            if name not in lengths:
-                (self.path / name).write_text(head)
-            os.truncate(self.path / name, lengths.get(name, len(head)))
+            if name in lengths:
+                os.truncate(self.path / name, lengths[name])
+            else:
+                (self.path / name).write_text(",".join(columns) + "\n")
         (self.path / "warnings.log").touch()
         os.truncate(self.path / "warnings.log", lengths.get("warnings.log", 0))
         for path in (self.path / "bonus").glob("step-*.npz"):
@@ -208,6 +208,12 @@ def told(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise BadInput(f"{path} cannot be read and written: {error.strerror or error}.") from error
+
+
+def make_room(file: Path) -> None:
+    """Make the folder of a file that will be written when work is done; `BadInput` now if that cannot be."""
+    with told(file.parent):
+        file.parent.mkdir(parents=True, exist_ok=True)
 
 
 def is_run(path: Path) -> bool:
