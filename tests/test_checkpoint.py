@@ -191,7 +191,7 @@ def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path, monkeypatch: 
     with monkeypatch.context() as then:
         then.setattr(checkpoint, "FORMAT", 99)
         saved(tmp_path, 2)
-    with pytest.raises(Damaged, match="it has format 99, and this version reads format 1"):
+    with pytest.raises(Damaged, match="it has format 99, and this version reads format 2"):
         restore(tmp_path, 2, empty())
 
 

@@ -358,7 +358,7 @@ class Order(Quiet):
     def __init__(self, last: int, monkeypatch: pytest.MonkeyPatch) -> None:
         self.last, self.step = last, 0
         self.called: dict[int, list[str]] = defaultdict(list)
-        for name, place in (("one", 1), ("every", 0), ("look", 1)):
+        for name, place in (("one", 1), ("propose", 0), ("every", 0), ("look", 1)):
             monkeypatch.setattr(Runs, name, self.noting(getattr(Runs, name), place))
 
     def noting(self, real: Any, place: int) -> Any:

@@ -23,7 +23,7 @@ from senior.learner import Run
 from senior.replay import Fact
 
 KEPT = 2
-FORMAT = 1
+FORMAT = 2
 _NAME = re.compile(r"step-(\d{10})\.npz")
 _CHUNK = re.compile(r"facts-(\d{10})-(\d{10})\.npz")
 

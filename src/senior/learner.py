@@ -60,7 +60,8 @@ class Run(NamedTuple):
     agent: sac.Agent
     model: model.RewardModel | None  # None for plain SAC
     replay: Replay
-    entropy: state_entropy.StateEntropy | None  # None without pre-training
+    entropy: state_entropy.StateEntropy | None  # this and the next: None without pre-training
+    deviation: state_entropy.Deviation | None
     bonus: Any
     length_scale: Float[Array, ""]
     learned_return: Float[Array, ""]  # learned reward summed over the running episode
@@ -103,6 +104,8 @@ class Learner:
         key_agent, key_model = jax.random.split(jax.random.fold_in(jax.random.key(seed), Purpose.INIT))
         learns = config.method.learns_reward
         size_in = spec.observation_size + spec.action_size
+        until, neighbours = config.pretraining.until, config.pretraining.neighbours
+        entropy, deviation = state_entropy.init(until, spec.observation_size, neighbours) if until else (None, None)
         return Run(
             seed=seed,
             numbers=_numbers(config),
@@ -118,9 +121,8 @@ class Learner:
             if learns
             else None,
             replay=replay_.init(config.capacity, spec.observation_size, spec.action_size),
-            entropy=state_entropy.init(config.pretraining.until, spec.observation_size, config.pretraining.neighbours)
-            if config.pretraining.until
-            else None,
+            entropy=entropy,
+            deviation=deviation,
             bonus=self.bonus.init(),
             length_scale=jnp.float32(spec.length_scale or 1.0),
             learned_return=jnp.zeros(()),
@@ -148,10 +150,10 @@ class Learner:
         """One update whose reward is the state entropy."""
         key_batch, key_update = jax.random.split(_key(run, Purpose.UPDATE, step))
         batch = replay_.sample(run.replay, key_batch, self.config.sac.batch)
-        entropy, reward = state_entropy.reward(_some(run.entropy), batch.row)
+        deviation, reward = state_entropy.reward(_some(run.entropy), _some(run.deviation), batch.row)
         move = step % self.config.sac.target_every == 0
         agent, info = sac.update(run.agent, batch, reward, key_update, run.numbers.sac, move)
-        return run._replace(agent=agent, entropy=entropy), info
+        return run._replace(agent=agent, deviation=deviation), info
 
     def learn(self, run: Run, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
         """The ordinary updates of a step."""

@@ -1,8 +1,10 @@
 """Algorithm 1 of the paper as one ordinary loop. Host code only: what is computed is in `senior.learner`.
 
-A step of every run: choose an action; take it; if a session is due, select, ask, fit and relabel; if due, the
-outer step; if due, refresh the bonus; update; store. Taking the action commutes with all that follows, and is done
-first so that an environment that breaks leaves a whole step undone, to be resumed.
+A step of every run: choose an action; if a session is due, select, ask, fit and relabel; if due, the outer step; if
+due, refresh the bonus; update; take the action; store. The update waits for nothing that taking the action gives, so
+the environments are stepped while the device computes it, and it counts only once they have been: an environment that
+breaks leaves a whole step undone, to be resumed. Where something rare is due that cannot be taken back (answers that
+were given), the action is taken first.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from senior.envs.vector import Failure, Step
 from senior.evaluate import EpisodeFailed, judge, summary
 from senior.learner import Purpose, act, acting, mean_action
 from senior.replay import Fact
-from senior.runs import Runs
+from senior.runs import PerRun, Proposal, Runs
 from senior.schedule import Due, due
 from senior.select import Context, probability_second
 from senior.trainee import Trainee
@@ -107,26 +109,29 @@ class Training:
                     [np.int32(step)] * len(plans),
                     [np.bool_(plan.random) for plan in plans],
                 )
-                actions = [np.asarray(actions[i]) if on else None for i, on in enumerate(self.mask())]
-            with self.clock.part("environment"):
-                happened = self.take(actions, step)
-
-            with self.clock.part("session"):
-                for i in self.active():
-                    self.now_and_then(i, step, plans[i])
-            with self.clock.part("update"):
-                info = self.update(step, plans)
                 if self.waits:
-                    self.wait()
+                    jax.block_until_ready([actions[i] for i in self.active()])
+            happened = None
+            if any(plan.rare for plan in plans):
+                happened = self.take(actions, step)
+                with self.clock.part("session"):
+                    for i in self.active():
+                        self.now_and_then(i, step, plans[i])
+            with self.clock.part("update"):
+                update = self.update(step, plans)
+                if self.waits:
+                    self.wait(update)
+            if happened is None:
+                happened = self.take(actions, step)
             with self.clock.part("store"):
-                self.store(step, plans, happened, info)
+                self.store(step, plans, happened, update)
                 if self.waits:
                     self.wait()
             self.watcher.advance(step + 1, self.trainees)
 
-    def wait(self) -> None:
-        """Until the device has done everything asked of it."""
-        self.runs.wait()
+    def wait(self, update: Proposal | None = None) -> None:
+        """Until the device has done everything asked of it, that update included."""
+        self.runs.wait(update)
 
     def active(self) -> list[int]:
         """Runs that have not failed."""
@@ -137,45 +142,47 @@ class Training:
 
     # Every step.
 
-    def take(self, actions: Sequence[np.ndarray | None], step: int) -> list[Step | None]:
+    def take(self, actions: PerRun, step: int) -> list[Step | None]:
         """Step the environments; a run whose environment breaks is saved as it was, and stopped."""
-        happened: list[Step | None] = []
-        for i, (trainee, action) in enumerate(zip(self.trainees, actions, strict=True)):
-            result = None if action is None else trainee.environment.step(0, action)
-            if isinstance(result, Failure):
-                self.fail(i, step, result.message)
-                result = None
-            happened.append(result)
+        happened: list[Step | None] = [None] * len(self.trainees)
+        with self.clock.part("act"):
+            chosen = {i: np.asarray(actions[i]) for i in self.active()}
+        with self.clock.part("environment"):
+            for i, action in chosen.items():
+                result = self.trainees[i].environment.step(0, action)
+                if isinstance(result, Failure):
+                    self.fail(i, step, result.message)
+                else:
+                    happened[i] = result
         return happened
 
-    def update(self, step: int, plans: Sequence[Due]) -> Any:
-        """The update of every run: state entropy in pre-training, the learned reward afterwards."""
-        learner, steps = self.trainees[0].learner, [np.int32(step)] * len(plans)
-        info = None
-        pretrain = [plan.pretrain and on for plan, on in zip(plans, self.mask(), strict=True)]
-        if any(pretrain):
-            info = self.runs.every(learner.pretrain, pretrain, steps)
-        ordinary = [plan.update and on for plan, on in zip(plans, self.mask(), strict=True)]
-        if any(ordinary):
-            info = self.runs.every(learner.learn, ordinary, steps)
-        for trainee, first, second in zip(self.trainees, pretrain, ordinary, strict=True):
-            trainee.progress.pretraining_updates += first
-            trainee.progress.updates += second * trainee.config.sac.updates
-        return info
+    def update(self, step: int, plans: Sequence[Due]) -> Proposal | None:
+        """What the update would make of every run, on state entropy in pre-training, on rewards afterwards.
 
-    def store(self, step: int, plans: Sequence[Due], happened: Sequence[Step | None], info: Any) -> None:
-        """Store what happened in every run, and count it."""
-        learner = self.trainees[0].learner
+        All runs have one configuration, so what is due is due for all.
+        """
+        learner, steps = self.trainees[0].learner, [np.int32(step)] * len(plans)
+        if plans[0].pretrain:
+            return self.runs.propose(learner.pretrain, ("agent", "deviation"), self.mask(), steps)
+        if plans[0].update:
+            return self.runs.propose(learner.learn, ("agent",), self.mask(), steps)
+        return None
+
+    def store(self, step: int, plans: Sequence[Due], happened: Sequence[Step | None], update: Proposal | None) -> None:
+        """Let the update count, store what happened in every run, and count both."""
+        learner, mask = self.trainees[0].learner, self.mask()
+        info = self.runs.accept(update, mask) if update else None
         facts = [_fact(trainee, one) for trainee, one in zip(self.trainees, happened, strict=True)]
-        until = self.trainees[0].config.pretraining.until
-        function = learner.store_pretraining if step < until else learner.store
-        returns = self.runs.every(function, self.mask(), facts)
+        if step < self.trainees[0].config.pretraining.until:
+            returns = self.runs.every(learner.store_pretraining, ("replay", "learned_return", "entropy"), mask, facts)
+        else:
+            returns = self.runs.every(learner.store, ("replay", "learned_return"), mask, facts)
         for i in self.active():
-            one = happened[i]
+            one, plan, trainee = happened[i], plans[i], self.trainees[i]
+            trainee.progress.pretraining_updates += plan.pretrain
+            trainee.progress.updates += plan.update * trainee.config.sac.updates
             if one is not None:
-                self.trainees[i].record(
-                    step, one, returns[i] if one.ended else None, info[i] if one.ended and info else None
-                )
+                trainee.record(step, one, returns[i] if one.ended else None, info[i] if one.ended and info else None)
 
     # Now and then, one run at a time.
 

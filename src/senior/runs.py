@@ -7,11 +7,13 @@ What is rare (sessions, fits, refreshes) is called for one run at a time, by ind
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +31,14 @@ class PerRun(Protocol):
     def __getitem__(self, i: int, /) -> Any: ...
 
 
+class Proposal(NamedTuple):
+    """What a function would change in all runs: the fields' new values, per run or stacked, and its results."""
+
+    changes: Sequence[str]
+    fields: Any
+    results: Any
+
+
 class Runs:
     """The traced states of R runs. Functions are compiled once each and own the state they are given."""
 
@@ -36,7 +46,7 @@ class Runs:
         self.size = len(states)
         self.lift = lift
         self._loop = list(states) if lift == "loop" else []
-        self._stack = _stack(states) if lift == "vmap" else None
+        self._stack: Run | None = _stack(states) if lift == "vmap" else None
 
     def __getitem__(self, i: int) -> Run:
         """The state of run ``i``. Do not keep it across a call: its arrays are given away."""
@@ -48,9 +58,9 @@ class Runs:
         else:
             self._stack = jax.tree.map(lambda leaf, new: leaf.at[i].set(new), self._stack, state)
 
-    def wait(self) -> None:
-        """Until everything asked of the device is done."""
-        jax.block_until_ready((self._loop, self._stack))
+    def wait(self, proposal: Proposal | None = None) -> None:
+        """Until everything asked of the device is done, ``proposal`` included."""
+        jax.block_until_ready((self._loop, self._stack, proposal and proposal.fields))
 
     def view(self, i: int, pick: Callable[[Run], Any]) -> Any:
         """A part of the state of run ``i``, without copying the rest. Not to be kept either."""
@@ -58,21 +68,53 @@ class Runs:
             return pick(self._loop[i])
         return jax.tree.map(lambda leaf: leaf[i], pick(self._stack))  # pyright: ignore[reportArgumentType]
 
-    def every(self, of_one: OfOneRun, active: Sequence[bool], *columns: Sequence[Any]) -> PerRun:
-        """Call a function for all active runs; each column holds one argument per run.
+    def propose(
+        self, of_one: OfOneRun, changes: Sequence[str], active: Sequence[bool], *columns: Sequence[Any]
+    ) -> Proposal:
+        """Compute a function for all active runs, and leave their states as they are until `accept`.
 
-        Under vmap inactive runs are computed too and their results mean nothing.
+        changes: the fields of `Run` that the function changes. Each column holds one argument per run.
+        The device works on while this returns. Under vmap inactive runs are computed too and their results mean
+        nothing.
         """
-        function = compiled(of_one, self.lift, "every", donate=True)
+        return self._propose(of_one, changes, False, active, columns)
+
+    def accept(self, proposal: Proposal, active: Sequence[bool]) -> PerRun:
+        """Put what was proposed into the states of the active runs; returns the function's results."""
         if self.lift == "vmap":
-            stacked = [_stack(column) for column in columns]
-            self._stack, results = function(self._stack, *stacked)
-            return _Stacked(results)
-        results: list[Any] = [None] * self.size
-        for i in range(self.size):
+            assert self._stack is not None
+            self._stack = self._stack._replace(**dict(zip(proposal.changes, proposal.fields, strict=True)))
+            return _Stacked(proposal.results)
+        for i, on in enumerate(active):
+            if on:
+                fields = dict(zip(proposal.changes, proposal.fields[i], strict=True))
+                self._loop[i] = self._loop[i]._replace(**fields)
+        return proposal.results
+
+    def every(
+        self, of_one: OfOneRun, changes: Sequence[str], active: Sequence[bool], *columns: Sequence[Any]
+    ) -> PerRun:
+        """`propose` and `accept` in one, in the arrays that the states have."""
+        return self.accept(self._propose(of_one, changes, True, active, columns), active)
+
+    def _propose(
+        self,
+        of_one: OfOneRun,
+        changes: Sequence[str],
+        donate: bool,
+        active: Sequence[bool],
+        columns: Sequence[Sequence[Any]],
+    ) -> Proposal:
+        function = compiled(of_one, self.lift, tuple(changes), donate)
+        if self.lift == "vmap":
+            assert self._stack is not None
+            return Proposal(changes, *function(*_part(self._stack, changes), *map(_stack, columns)))
+        fields, results = [None] * self.size, [None] * self.size
+        for i, state in enumerate(self._loop):
             if active[i]:
-                self._loop[i], results[i] = function(self._loop[i], *(column[i] for column in columns))
-        return results
+                arguments = (column[i] for column in columns)
+                fields[i], results[i] = function(*_part(state, changes), *arguments)
+        return Proposal(changes, fields, results)
 
     def look(
         self,
@@ -82,7 +124,7 @@ class Runs:
         *columns: Sequence[Any],
     ) -> PerRun:
         """Call a function of a part of the state, which it leaves as it is, for all active runs."""
-        function = compiled(of_part, self.lift, "every", donate=False)
+        function = compiled(of_part, self.lift, None, donate=False)
         if self.lift == "vmap":
             stacked = [_stack(column) for column in columns]
             return _Stacked(function(pick(self._stack), *stacked))  # pyright: ignore[reportArgumentType]
@@ -93,7 +135,7 @@ class Runs:
 
     def one(self, i: int, of_one: OfOneRun, *arguments: Any) -> Any:
         """Call a function for run ``i`` alone."""
-        function = compiled(of_one, self.lift, "one", donate=True)
+        function = compiled(of_one, self.lift, "all", donate=True)
         if self.lift == "vmap":
             self._stack, result = function(self._stack, jnp.int32(i), *arguments)
         else:
@@ -102,11 +144,38 @@ class Runs:
 
 
 @lru_cache(maxsize=256)
-def compiled(of_one: Callable[..., Any], lift: Lift, use: Literal["every", "one"], donate: bool) -> Any:
-    """A function of one run, lifted and compiled. The same function is the same program for all that use it."""
-    at_all = jax.vmap if use == "every" else _at
-    function = of_one if lift == "loop" else at_all(of_one)
+def compiled(
+    of_one: Callable[..., Any], lift: Lift, changes: tuple[str, ...] | Literal["all"] | None, donate: bool
+) -> Any:
+    """A function of one run, lifted and compiled. The same function is the same program for all that use it.
+
+    changes: fields of every run that it changes; "all": it may change everything of the one run it is called for;
+    None: it changes nothing.
+    """
+    if changes == "all":
+        function = of_one if lift == "loop" else _at(of_one)
+    else:
+        function = _of_part(of_one, changes) if changes else of_one
+        function = function if lift == "loop" else jax.vmap(function)
     return jax.jit(function, donate_argnums=0 if donate else ())
+
+
+def _part(state: Run, changes: Sequence[str]) -> tuple[tuple[Any, ...], Run]:
+    """The fields that will change, and the state without them."""
+    return tuple(getattr(state, name) for name in changes), state._replace(**dict.fromkeys(changes))
+
+
+def _of_part(of_one: OfOneRun, changes: Sequence[str]) -> Callable[..., tuple[tuple[Any, ...], Any]]:
+    """A function of one run as one of `_part`: what it does not change is neither given away nor given back."""
+
+    def call(fields: tuple[Any, ...], rest: Run, *arguments: Any) -> tuple[tuple[Any, ...], Any]:
+        before = rest._replace(**dict(zip(changes, fields, strict=True)))
+        after, result = of_one(before, *arguments)
+        touched = [name for name in Run._fields if getattr(after, name) is not getattr(before, name)]
+        assert set(touched) <= set(changes), f"{of_one} changes {touched}, not only {changes}"
+        return tuple(getattr(after, name) for name in changes), result
+
+    return call
 
 
 def _stack(trees: Sequence[Any]) -> Any:
@@ -138,6 +207,7 @@ def prepare_device(wanted: str) -> str:
     Raises `BadInput` if a GPU is asked for and there is none.
     """
     _avoid_hang()
+    _keep_memory()
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "senior" / "xla"
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
         jax.config.update("jax_compilation_cache_dir", str(cache))
@@ -161,6 +231,23 @@ def _avoid_hang() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if flag not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {flag}=false".strip()
+
+
+def _keep_memory() -> None:
+    """Let glibc keep the memory that every update takes and frees, instead of fetching it from the system anew.
+
+    An update of the paper's sizes takes 18 MB for its results and in between, which was a thousand page faults and
+    1 ms of 15 (benchmarks/README.md). The numbers are mallopt's: take up to 32 MB, its largest, from the heap; give
+    back what exceeds 1 GB; grow by 64 MB. Where the C library has no mallopt (macOS) nothing happens.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        for parameter, value in (
+            (-3, 2**25),
+            (-1, 2**30),
+            (-2, 2**26),
+        ):  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_TOP_PAD
+            mallopt(parameter, value)
 
 
 def lift_for(device: str) -> Lift:

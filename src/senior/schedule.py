@@ -23,6 +23,11 @@ class Due(NamedTuple):
     pretrain: bool  # an update on state entropy
     update: bool  # an ordinary update
 
+    @property
+    def rare(self) -> bool:
+        """Whether more than an update is due."""
+        return bool(self.session) or self.outer or self.refresh or self.begin
+
 
 def due(config: Config, step: int, queried: int) -> Due:
     """What is due at ``step`` for a run that has asked ``queried`` pairs.

@@ -14,27 +14,29 @@ from jaxtyping import Array, Float, Int
 
 
 class StateEntropy(NamedTuple):
-    """The ``k+1`` smallest distances of each of the first ``n`` states, ascending, and a running deviation."""
+    """The ``k+1`` smallest distances of each of the first ``n`` states, ascending."""
 
     states: Float[Array, "n o"]
     nearest: Float[Array, "n k+1"]  # infinite where fewer states are known
     count: Int[Array, ""]
+
+
+class Deviation(NamedTuple):
+    """The running deviation of all distances that batches have looked up."""
+
     mean: Float[Array, ""]
     square: Float[Array, ""]  # sum of squared deviations from the mean
     seen: Float[Array, ""]
 
 
-def init(capacity: int, observation_size: int, neighbours: int) -> StateEntropy:
+def init(capacity: int, observation_size: int, neighbours: int) -> tuple[StateEntropy, Deviation]:
     """No state yet. ``capacity`` is the number of pre-training steps."""
-    zero = jnp.zeros(())
-    return StateEntropy(
+    table = StateEntropy(
         states=jnp.zeros((capacity, observation_size)),
         nearest=jnp.full((capacity, neighbours + 1), jnp.inf),
         count=jnp.zeros((), jnp.int32),
-        mean=zero,
-        square=zero,
-        seen=zero,
     )
+    return table, Deviation(jnp.zeros(()), jnp.zeros(()), jnp.zeros(()))
 
 
 def insert(entropy: StateEntropy, state: Float[Array, " o"]) -> StateEntropy:
@@ -56,14 +58,13 @@ def insert(entropy: StateEntropy, state: Float[Array, " o"]) -> StateEntropy:
     )
 
 
-def reward(entropy: StateEntropy, rows: Int[Array, " b"]) -> tuple[StateEntropy, Float[Array, " b"]]:
+def reward(entropy: StateEntropy, deviation: Deviation, rows: Int[Array, " b"]) -> tuple[Deviation, Float[Array, " b"]]:
     """Distance of each row to its k-th neighbour over the running deviation, which the batch enters first."""
     distance = entropy.nearest[rows, -1]
     size = distance.shape[0]
-    seen = entropy.seen + size
-    gap = distance.mean() - entropy.mean
-    mean = entropy.mean + gap * size / seen
-    square = entropy.square + jnp.sum((distance - distance.mean()) ** 2) + gap**2 * entropy.seen * size / seen
-    deviation = jnp.sqrt(square / seen)
-    entropy = entropy._replace(mean=mean, square=square, seen=seen)
-    return entropy, distance / jnp.where(deviation > 0, deviation, 1.0)
+    seen = deviation.seen + size
+    gap = distance.mean() - deviation.mean
+    mean = deviation.mean + gap * size / seen
+    square = deviation.square + jnp.sum((distance - distance.mean()) ** 2) + gap**2 * deviation.seen * size / seen
+    scale = jnp.sqrt(square / seen)
+    return Deviation(mean, square, seen), distance / jnp.where(scale > 0, scale, 1.0)
