@@ -1,8 +1,9 @@
-"""The update of soft actor-critic at the paper's sizes in PyTorch, to hold `senior bench` against in the same minutes.
+"""Soft actor-critic at the paper's sizes in PyTorch, to hold `senior bench` against in the same minutes.
 
-The established implementations of this family are written in PyTorch; most of a step of theirs is this update. Here it
-is alone, without replay, logging or environment: separate networks, three Adams, targets moved at every second step.
-It needs only torch (``pip install torch``) and prints milliseconds per update, the median of several blocks:
+The established implementations of this family are written in PyTorch. First the update alone, most of a step of theirs:
+separate networks, three Adams, targets moved at every second step. Then the step of such a loop, without logging and
+sessions: act, score with the three members of a reward ensemble, step door-lock, store in NumPy, draw a batch, update.
+It needs torch beside this package (``pip install torch``) and prints milliseconds, the median of several blocks:
 
     python benchmarks/pytorch_sac.py [--threads 2] [--updates 50] [--blocks 9]
 """
@@ -16,8 +17,11 @@ import math
 import statistics
 import time
 
+import numpy as np
 import torch
 from torch import nn
+
+from senior.envs import metaworld
 
 OBSERVATION, ACTION, WIDTH, LAYERS, BATCH = 39, 4, 256, 3, 512
 RATE, ALPHA_RATE, DISCOUNT, TAU, TARGET_EVERY = 3e-4, 1e-4, 0.99, 0.005, 2
@@ -84,6 +88,38 @@ class Agent:
                     slow.lerp_(fast, TAU)
 
 
+class Loop:
+    """A training loop around an agent, with what is rare left out."""
+
+    def __init__(self, agent: Agent, rows: int) -> None:
+        self.agent = agent
+        self.members = [nn.Sequential(perceptron(OBSERVATION + ACTION, 1), nn.Tanh()) for _ in range(3)]
+        self.env, _ = metaworld.make("door-lock")
+        self.observation = self.env.reset(seed=0)[0].astype(np.float32)
+        rng = np.random.default_rng(0)
+        sizes = (OBSERVATION, ACTION, OBSERVATION)
+        self.vectors = [rng.normal(size=(rows, size)).astype(np.float32) for size in sizes]
+        self.rewards = rng.normal(size=rows).astype(np.float32)
+        self.rng, self.count = rng, 0
+
+    def step(self, number: int) -> None:
+        s = self.observation
+        with torch.no_grad():
+            action = self.agent.sample(torch.from_numpy(s)[None])[0][0].numpy()
+            x = torch.from_numpy(np.concatenate([s, action]))[None]
+            learned = np.mean([member(x).item() for member in self.members])
+        drawn = self.rng.integers(len(self.rewards), size=BATCH)
+        before, acted, after = (torch.as_tensor(column[drawn]) for column in self.vectors)
+        self.agent.update(number, before, acted, torch.as_tensor(self.rewards[drawn]), after)
+        following, _, _, truncated, _ = self.env.step(action)
+        row = self.count % len(self.rewards)
+        for column, value in zip(self.vectors, (s, action, following), strict=True):
+            column[row] = value
+        self.rewards[row] = learned
+        self.count += 1
+        self.observation = (self.env.reset()[0] if truncated else following).astype(np.float32)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--threads", type=int, default=2)
@@ -99,18 +135,21 @@ def main() -> None:
         torch.randn(rows),
         torch.randn(rows, OBSERVATION),
     )
-    spent = []
-    for block in range(options.blocks + 1):  # the first warms up
-        began = time.perf_counter()
-        for step in range(options.updates):
-            drawn = torch.randint(rows, (BATCH,))
-            agent.update(step, *(column[drawn] for column in columns))
-        if block:
-            spent.append(1e3 * (time.perf_counter() - began) / options.updates)
-    print(
-        f"PyTorch {torch.__version__}, {options.threads} threads: {statistics.median(spent):.2f} ms per update "
-        f"(blocks of {options.updates}: {min(spent):.2f} to {max(spent):.2f})"
-    )
+
+    def update(step: int) -> None:
+        drawn = torch.randint(rows, (BATCH,))
+        agent.update(step, *(column[drawn] for column in columns))
+
+    print(f"PyTorch {torch.__version__}, {options.threads} threads, blocks of {options.updates}")
+    for name, function in (("update", update), ("step of the loop", Loop(agent, 1_000_000).step)):
+        spent = []
+        for block in range(options.blocks + 1):  # the first warms up
+            began = time.perf_counter()
+            for step in range(options.updates):
+                function(step)
+            if block:
+                spent.append(1e3 * (time.perf_counter() - began) / options.updates)
+        print(f"{name}: {statistics.median(spent):.2f} ms ({min(spent):.2f} to {max(spent):.2f})")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ LAYERS = (
     {"types"},
     {"agent", "reward", "replay", "preferences", "density"},
     {"select", "explore", "teachers", "envs"},
-    {"methods", "config", "presets"},
+    {"methods", "config", "checks", "presets"},
 )
 APART = {"select", "explore", "teachers", "envs"}
 WITHOUT_JAX = {"types", "preferences", "envs", "teachers", "report", "label"}  # and all below
@@ -82,7 +82,7 @@ def test_imports_point_one_way():
         ("senior.replay", "from senior.types import Batch", False),
         ("senior.types", "import senior.replay", True),
         ("senior.replay", "def f():\n    from senior import config", True),
-        ("senior.select.uniform", "from ..teachers.scripted import Oracle", True),
+        ("senior.select.uniform", "from ..teachers.scripted import Scripted", True),
         ("senior.select.uniform", "from .entropy import entropy", False),
         ("senior.select.uniform", "from ..density import Density", False),
         ("senior.density", "from senior import __version__", True),

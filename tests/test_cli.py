@@ -101,7 +101,8 @@ NUMBERS = {
     "--seed 4294967295 --seeds 2": "--seed must be below 4294967296",
     "--seeds 0": "--seeds must be at least 1, not 0",
     "--seeds two": "--seeds needs a whole number, not 'two'",
-    "--budget 4": "budget of 4 labels is below one session of 5",
+    "--budget 4 --per-session 5": "budget of 4 labels is below one session of 5",
+    "--budget many": "--budget needs a whole number",
     "--budget -3": "budget of -3 labels is below one session",
     "--budget 20 --per-session 21": "below one session of 21",
     "--refresh-every 300": "Q, --refresh-every 300, must divide K, --session-every 5000",
@@ -142,7 +143,7 @@ def test_numbers_that_make_no_sense(options: str, capsys: pytest.CaptureFixture[
 COMBINATIONS = {
     "--select none": "no reward model, so an outer step (bilevel) makes no sense",
     "--method sac --explore preference_guided": "no reward model, so a bonus",
-    "--method sac --mix curiosity": "no reward model, so a curiosity mix",
+    "--method sac --mix curiosity": "no reward model, so a mix of sources",
     "--method sac --pretraining.until 100": "--pretraining.until must be 0",
     "--mix uniform": "--explore preference_guided needs --mix curiosity",
     "--explore none": "--mix curiosity needs --explore preference_guided",
@@ -304,7 +305,8 @@ def test_tasks_and_methods_are_listed(capsys: pytest.CaptureFixture[str]):
     assert main(["methods"]) == DONE
     listed = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()[2:]}
     assert list(listed) == list(METHODS)
-    assert "motion_distinction  preference_guided  curiosity" in listed["m-senior"]
+    assert "motion_distinction  preference_guided  30% curiosity  bilevel every 10,000 steps" in listed["m-senior"]
+    assert listed["qpa"].endswith("50% recent     -                           1 member, snippets")
     assert listed["sac"].endswith("true reward")
 
 

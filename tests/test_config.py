@@ -10,12 +10,19 @@ from typing import Any
 import pytest
 
 from senior import bench, envs
-from senior.config import SAC, Config, Queries, check, differences, from_json, load, to_json
+from senior.checks import check
+from senior.config import SAC, Config, Queries, differences, from_json, load, to_json
 from senior.methods import METHODS, Method
 from senior.presets import PRESETS, preset, quick_changes
 from senior.types import BadInput
 
-EVERYTHING = [(name, task, row) for name in PRESETS for task in [*envs.names(), "some-other-robot"] for row in METHODS]
+EVERYTHING = [
+    (name, task, row)
+    for name in PRESETS
+    for task in [*envs.names(), "some-other-robot"]
+    for row in METHODS
+    if name != "qpa_original" or row == "qpa"
+]
 
 
 @pytest.mark.parametrize(("name", "task", "row"), EVERYTHING)
@@ -43,7 +50,8 @@ def test_every_task_has_room_for_a_segment(name: str):
     for task in envs.names():
         env, spec = envs.make(task)
         env.close()
-        assert preset(name, task, "m-senior").queries.segment < spec.horizon, task
+        method = "qpa" if name == "qpa_original" else "m-senior"
+        assert preset(name, task, method).queries.segment < spec.horizon, task
 
 
 def changed(*path: str, value: Any = 1) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from senior.reward.bilevel import FirstSteps
 from senior.reward.model import rewards
 from senior.runs import Runs
 from senior.schedule import plan
-from senior.teachers.scripted import Oracle
+from senior.teachers.scripted import Scripted
 from senior.trainee import Trainee
 from senior.types import Answers, Pairs, Preferred, Query
 from tests.equal import progress_of, short
@@ -118,12 +118,12 @@ def with_sac_settings(**settings: int) -> Learner:
 # Target networks.
 
 
-def moves(function: Any, run: Run, step: int) -> int:
+def moves(function: Any, run: Run, step: int, *more: Any) -> int:
     """How often the targets go a quarter of the way to critics that stand still."""
     run = with_sac(run, critic_rate=0, tau=0.25)
     critics = run.agent.critics
     targets = jax.tree.map(lambda weight: weight + 1, critics)
-    agent = after(function, run._replace(agent=run.agent._replace(targets=targets)), np.int32(step))[0].agent
+    agent = after(function, run._replace(agent=run.agent._replace(targets=targets)), np.int32(step), *more)[0].agent
     assert same(agent.critics, critics)
     if same(agent.targets, targets):
         return 0
@@ -143,7 +143,7 @@ def test_targets_move_at_updates_whose_number_is_a_multiple(
 ):
     """The numbers go on from step to step: with two updates each, step 500 makes numbers 1000 and 1001."""
     learner = with_sac_settings(updates=updates, target_every=target_every)
-    assert [moves(learner.learn, lived, step) for step in range(500, 504)] == expected
+    assert [moves(learner.learn, lived, step, np.int32(0)) for step in range(500, 504)] == expected
 
 
 def test_targets_move_at_every_other_update_of_pre_training(lived: Run):
@@ -186,8 +186,8 @@ def test_begin_renews_the_critics_and_takes_over_actor_and_temperature(lived: Ru
 
 def test_rates_of_actor_and_critics_fall_from_the_end_of_pre_training_and_that_of_the_temperature_stays(lived: Run):
     falling, before = with_rate_end(lived, 0), lived.agent
-    full, last = (after(LEARNER.learn, falling, np.int32(step))[0].agent for step in (UNTIL, LAST))
-    assert same(full, after(LEARNER.learn, lived, np.int32(UNTIL))[0].agent)
+    full, last = (after(LEARNER.learn, falling, np.int32(step), np.int32(0))[0].agent for step in (UNTIL, LAST))
+    assert same(full, after(LEARNER.learn, lived, np.int32(UNTIL), np.int32(0))[0].agent)
     assert gap(full.actor, before.actor) > 0.1 * CONFIG.sac.actor_rate
     assert same((last.actor, last.critics), (before.actor, before.critics))
     assert gap(last.log_alpha, before.log_alpha) > 0.1 * CONFIG.sac.alpha_rate
@@ -227,7 +227,7 @@ def test_plain_sac_learns_from_the_true_reward_and_the_others_from_the_learned_o
         run = learner.init(3)._replace(replay=curious.replay)
 
     def learned(run: Run) -> Agent:
-        return after(learner.learn, run, np.int32(500))[0].agent
+        return after(learner.learn, run, np.int32(500), np.int32(0))[0].agent
 
     agent = learned(run)
     assert same(learned(with_true_reward_changed(run)), agent) == (method != "sac")
@@ -239,7 +239,7 @@ def test_rows_of_the_curiosity_buffer_carry_their_own_learned_reward(curious: Ru
     changed = curious.bonus._replace(curiosity=held._replace(learned_reward=held.learned_reward - 2))
     other = curious.bonus._replace(curiosity=held._replace(reward=held.reward - 2))
     agents = [
-        after(LEARNER.learn, curious._replace(bonus=bonus), np.int32(500))[0].agent
+        after(LEARNER.learn, curious._replace(bonus=bonus), np.int32(500), np.int32(0))[0].agent
         for bonus in (curious.bonus, changed, other)
     ]
     assert not same(agents[1].critics, agents[0].critics)
@@ -393,7 +393,7 @@ class Skipper:
     """Skips all pairs of its first session and two of each that follows, and calls one of these equal."""
 
     def __init__(self) -> None:
-        self.oracle = Oracle()
+        self.oracle = Scripted()
         self.sessions = 0
 
     def ask(self, ids: list[int], query: Query) -> None:
@@ -451,7 +451,7 @@ def test_skipped_pairs_are_spent_and_nothing_is_learned_before_the_first_label(t
     assert result.labels == progress["labels"] == 25 - 14
 
 
-class Dawdler(Oracle):
+class Dawdler(Scripted):
     """Leaves one pair for later."""
 
     def collect(self) -> Answers:
@@ -459,7 +459,7 @@ class Dawdler(Oracle):
         return Answers(answers.ids[1:], answers.labels[1:])
 
 
-class Mumbler(Oracle):
+class Mumbler(Scripted):
     """Says what is no answer."""
 
     def collect(self) -> Answers:

@@ -61,6 +61,9 @@ def replay_of(facts: int = FACTS, size: int = 80, o: int = O) -> Replay:
     return held
 
 
+EMPTY = replay.gather(replay.init(1, O, A), jnp.zeros(1, jnp.int32))
+
+
 def preferred_of(seed: int = 1, n: int = 30) -> np.ndarray:
     return np.random.default_rng(seed).normal(0.1, 0.1, (n, 2)).astype(np.float32)
 
@@ -184,7 +187,7 @@ def test_beta_begins_at_its_first_value_and_decays_with_its_clock(clock: str, ex
     state = bonus.on_session(bonus.init(), jax.random.key(1), jnp.asarray(preferred_of()), jnp.int32(30))
     for k in range(4):
         state = bonus.on_refresh(state, jax.random.key(k), replay_of(), now(1000 + 30 * k, 30 * k))
-        betas.append(float(bonus.report(state)["beta"]))
+        betas.append(float(bonus.report(state, EMPTY, now())["beta"]))
         assert int(state.refreshes) == k + 1
     np.testing.assert_allclose(betas, [0.2 * 0.99**t for t in exponents], rtol=1e-4)
 
@@ -206,7 +209,7 @@ def test_the_bonus_is_beta_times_the_intrinsic_reward_on_curiosity_rows_and_noth
     r_int = np.asarray(state.intrinsic)
     expected = 0.1 * 0.5**2 * np.array([r_int[0], r_int[7], 0, r_int[39], 0, 0, r_int[5]])
     np.testing.assert_allclose(value, expected, rtol=1e-5)
-    np.testing.assert_allclose(bonus.report(state)["intrinsic_mean"], r_int.mean(), rtol=1e-5)
+    np.testing.assert_allclose(bonus.report(state, EMPTY, now())["intrinsic_mean"], r_int.mean(), rtol=1e-5)
 
 
 @pytest.mark.parametrize("when", ["before anything", "before a session", "after a session without a label"])
@@ -269,7 +272,7 @@ def begun(preferred: int = 30) -> learner.Run:
 @pytest.mark.parametrize(("batch", "share", "curious"), [(512, 0.3, 153), (128, 0.3, 38), (10, 0.0, 0), (10, 1.0, 10)])
 def test_a_share_of_every_batch_comes_from_the_curiosity_buffer(batch: int, share: float, curious: int):
     run, held = begun(), begun().bonus.curiosity
-    drawn = jax.tree.map(np.asarray, jax.jit(learner_of(batch, share)._draw)(run, jax.random.key(0)))
+    drawn = jax.tree.map(np.asarray, jax.jit(learner_of(batch, share)._draw)(run, jax.random.key(0), jnp.int32(0)))
     assert np.bincount(drawn.source, minlength=2).tolist() == [batch - curious, curious]
     of_buffer = drawn.source == Source.CURIOSITY
     assert np.array_equal(drawn.observation[of_buffer], np.asarray(held.observation)[drawn.row[of_buffer]])
@@ -281,7 +284,7 @@ def test_a_share_of_every_batch_comes_from_the_curiosity_buffer(batch: int, shar
 
 
 def test_without_a_preferred_position_the_batch_is_the_replays_alone():
-    drawn = jax.jit(learner_of()._draw)(begun(preferred=0), jax.random.key(0))
+    drawn = jax.jit(learner_of()._draw)(begun(preferred=0), jax.random.key(0), jnp.int32(0))
     assert np.array_equal(drawn.source, np.full(128, Source.REPLAY))
     _, info = learn()(begun(preferred=0), jnp.int32(51))
     assert float(info["bonus_mean"]) == 0

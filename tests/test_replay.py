@@ -180,7 +180,7 @@ def live(trainee: Trainee, lengths: list[int]) -> None:
     for length in lengths:
         for t in range(length):
             ended = t == length - 1
-            trainee.record(step, Step(nothing, nothing[:2], 0.0, nothing, False, ended, None), 0.0, None)
+            trainee.record(step, Step(nothing, nothing[:2], 0.0, nothing, False, ended, None), 0.0, {})
             step += 1
 
 

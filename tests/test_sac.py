@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from senior.agent import sac
-from senior.agent.networks import MLP
+from senior.agent.networks import MLP, normalised_relu
 from senior.types import Batch, Source
 from tests.numeric import Arrays, numeric_gradient
 
@@ -53,11 +53,13 @@ def batch_of(seed: int, size: int = B) -> Batch:
 # The same in NumPy, one net at a time.
 
 
-def net(parameters: Sequence[np.ndarray], x: np.ndarray) -> np.ndarray:
-    """Perceptron of the parameters ``[w0, w1, ..., b0, b1, ...]`` with ReLU."""
+def net(parameters: Sequence[np.ndarray], x: np.ndarray, normalised: bool = False) -> np.ndarray:
+    """Perceptron of the parameters ``[w0, w1, ..., b0, b1, ...]`` with ReLU, each layer normalised before it or not."""
     half = len(parameters) // 2
     for i, (weight, bias) in enumerate(zip(parameters[:half], parameters[half:], strict=True)):
         x = x @ weight + bias
+        if i < half - 1 and normalised:
+            x = (x - x.mean(axis=-1, keepdims=True)) / np.sqrt(x.var(axis=-1, keepdims=True) + 1e-5)
         x = np.maximum(x, 0) if i < half - 1 else x
     return x
 
@@ -66,9 +68,9 @@ def flat(tree: MLP) -> Arrays:
     return [np.asarray(x, np.float64) for x in (*tree.weights, *tree.biases)]
 
 
-def q_values(critics: Arrays, observation: np.ndarray, action: np.ndarray) -> np.ndarray:
+def q_values(critics: Arrays, observation: np.ndarray, action: np.ndarray, normalised: bool = False) -> np.ndarray:
     x = np.concatenate([observation, action], axis=-1)
-    return np.stack([net([p[j] for p in critics], x)[:, 0] for j in (0, 1)])
+    return np.stack([net([p[j] for p in critics], x, normalised)[:, 0] for j in (0, 1)])
 
 
 def policy(actor: Arrays, observation: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,20 +160,25 @@ def test_layers_begin_orthogonal_with_zero_biases():
 
 # One update against gradients by finite differences.
 
+NORMALISED = pytest.mark.parametrize("normalised", [False, True])
 
-def test_critics_descend_on_the_squared_error_to_the_bootstrapped_target():
+
+@NORMALISED
+def test_critics_descend_on_the_squared_error_to_the_bootstrapped_target(normalised: bool):
     """y = r + gamma m (min Q'(s', a') - alpha log pi(a'|s')); the loss is the sum of both mean squared errors."""
     agent, batch, key = agent_of(5), batch_of(6), jax.random.key(7)
     assert 0 < batch.bootstrap.sum() < B
     reward = np.linspace(-1, 2, B)
-    after, info = jax.jit(sac.update_critics)(agent, batch, jnp.asarray(reward), key, NUMBERS)
+    activation = normalised_relu if normalised else jax.nn.relu
+    update = jax.jit(sac.update_critics, static_argnums=5)
+    after, info = update(agent, batch, jnp.asarray(reward), key, NUMBERS, activation)
 
     action, log_prob = policy(flat(agent.actor), batch.next_observation, noise_of(key))
-    value = q_values(flat(agent.targets), batch.next_observation, action).min(axis=0)
+    value = q_values(flat(agent.targets), batch.next_observation, action, normalised).min(axis=0)
     target = reward + 0.9 * batch.bootstrap * (value - np.exp(float(agent.log_alpha)) * log_prob)
 
     def loss(critics: Arrays) -> float:
-        return ((q_values(critics, batch.observation, batch.action) - target) ** 2).mean(axis=1).sum()
+        return ((q_values(critics, batch.observation, batch.action, normalised) - target) ** 2).mean(axis=1).sum()
 
     np.testing.assert_allclose(info["critic_loss"], loss(flat(agent.critics)), rtol=1e-4)
     gradient = numeric_gradient(loss, flat(agent.critics))
@@ -179,14 +186,16 @@ def test_critics_descend_on_the_squared_error_to_the_bootstrapped_target():
     assert_same(agent._replace(critics=None, critic_adam=None), after._replace(critics=None, critic_adam=None))
 
 
-def test_actor_descends_on_alpha_log_pi_minus_the_smaller_q():
+@NORMALISED
+def test_actor_descends_on_alpha_log_pi_minus_the_smaller_q(normalised: bool):
     agent, batch, key = agent_of(8), batch_of(9), jax.random.key(10)
-    after, info = jax.jit(sac.update_actor)(agent, batch, key, NUMBERS)
+    activation = normalised_relu if normalised else jax.nn.relu
+    after, info = jax.jit(sac.update_actor, static_argnums=4)(agent, batch, key, NUMBERS, activation)
     critics, noise, alpha = flat(agent.critics), noise_of(key), np.exp(float(agent.log_alpha))
 
     def loss(actor: Arrays) -> float:
         action, log_prob = policy(actor, batch.observation, noise)
-        return (alpha * log_prob - q_values(critics, batch.observation, action).min(axis=0)).mean()
+        return (alpha * log_prob - q_values(critics, batch.observation, action, normalised).min(axis=0)).mean()
 
     np.testing.assert_allclose(info["actor_loss"], loss(flat(agent.actor)), rtol=1e-4)
     log_prob = policy(flat(agent.actor), batch.observation, noise)[1]

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import pytest
 
-from senior.config import check, from_json, to_json
+from senior.checks import check
+from senior.config import Bilevel, Config, differences
 from senior.methods import METHODS
-from senior.presets import PAPER, PRESETS, preset
-from senior.schedule import due, plan
-from senior.types import BadInput
+from senior.presets import PAPER, preset, release, with_budget
+from senior.schedule import Counts, due, plan
+from tests.small import small
 
 
 @pytest.mark.parametrize(
@@ -32,6 +33,100 @@ def test_the_papers_runs(task: str, sessions: int, last: int, outer: int):
     assert counts.updates == 1_000_000 - 10_000 - 1 + 100
 
 
+def every_step(config: Config) -> Counts:
+    """The same counts by asking at every single step what is due."""
+    sessions = queried = last = outer = refreshes = pretraining = updates = 0
+    for step in range(config.steps):
+        now = due(config, step, queried)
+        if now.session:
+            sessions, queried, last = sessions + 1, queried + now.session, step
+        outer, refreshes, pretraining = outer + now.outer, refreshes + now.refresh, pretraining + now.pretrain
+        updates += now.update * config.sac.updates + now.begin * config.sac.reset_updates
+    return Counts(sessions, queried, last, outer, refreshes, pretraining, updates)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_plan_is_what_comes_of_asking_at_every_step(method: str):
+    for config in (
+        replace(preset("paper", "door-open", method), steps=60_123),
+        preset("quick", "door-close", method),
+        replace(preset("quick", "window-open", method), steps=21_001),
+        small(method),
+        replace(small(method), steps=401, bilevel=Bilevel(every=100, after_budget=True)),
+    ):
+        assert plan(config) == every_step(config)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("task", PAPER)
+def test_sessions_queries_outer_steps_and_refreshes_of_every_method_and_task(method: str, task: str):
+    """By arithmetic from the tables: nothing of the schedule's own is used."""
+    row, numbers = METHODS[method], PAPER[task]
+    config = preset("paper", task, method)
+    counts = plan(config)
+    if method == "sac":
+        assert counts == Counts(0, 0, 0, 0, 0, 0, 1_000_000 - 5001)
+        return
+    sessions = -(-numbers.budget // numbers.per_session)
+    last = 10_000 + 5000 * (sessions - 1)
+    outer = len([step for step in range(20_000, 1_000_000, 10_000) if step < last])
+    pge = row.explore == "preference_guided"
+    assert counts == Counts(
+        sessions,
+        numbers.budget,
+        last,
+        outer if row.outer == "bilevel" else 0,
+        990_000 // numbers.refresh_every if pge else 0,
+        8999,
+        990_000 - 1 + 100,
+    )
+    assert config.window == ((60 if task == "door-open" else 30) if method == "qpa" else 100)
+    assert config.reward.members == (1 if method == "qpa" else 3)
+    assert config.reward.epochs == (200 if method == "qpa" else 10)
+    assert bool(config.reward.snippets) == (method == "qpa")
+    beta, decay = {"disagreement": (config.rune.beta, config.rune.decay)}.get(
+        row.explore, (config.pge.beta, config.pge.decay)
+    )
+    assert (beta, decay) == ((0.05, 1e-5) if row.explore == "disagreement" else (0.1, 0.01))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("task", PAPER)
+def test_the_quick_preset_spends_its_budget_while_it_learns(method: str, task: str):
+    config = preset("quick", task, method)
+    counts = plan(config)
+    assert counts.queried == (0 if method == "sac" else 250)
+    assert counts.last_session <= 0.6 * config.steps
+
+
+@pytest.mark.parametrize(
+    ("task", "budget", "per_session"),
+    [("door-lock", *pair) for pair in ((150, 3), (250, 5), (500, 10), (1000, 20))]
+    + [("window-open", *pair) for pair in ((150, 6), (250, 10), (500, 20), (1000, 40))],
+)
+def test_the_papers_other_budgets_take_as_many_sessions(task: str, budget: int, per_session: int):
+    before = preset("paper", task, "m-senior")
+    config = check(with_budget(before, budget))
+    assert config.queries.per_session == per_session
+    counts = plan(config)
+    assert counts.queried == budget
+    assert counts.sessions == plan(before).sessions
+
+
+def test_what_the_public_code_does_otherwise():
+    before = preset("paper", "door-lock", "m-senior")
+    config = check(release(before))
+    assert plan(config).refreshes == plan(before).refreshes - plan(before).outer_steps
+    assert not due(config, 20_000, 20).refresh
+    assert due(config, 21_000, 20).refresh
+    assert due(config, 10_000, 0).refresh
+    changed = {name for name, _, _ in differences(before, config)}
+    assert changed == {
+        "compat", "mds.density_sum", "mds.axis", "mds.scores", "pge.bandwidth", "pge.clock", "pge.equal",
+        "pge.relabel", "pge.rest", "pge.refresh_with_outer", "bilevel.batch",
+    }  # fmt: skip
+
+
 def test_p_senior_has_no_outer_step_and_sac_asks_nothing():
     short = {"steps": 30_000}
     assert plan(replace(preset("paper", "door-lock", "p-senior"), **short)).outer_steps == 0
@@ -51,18 +146,3 @@ def test_outer_steps_stop_with_the_budget_unless_told_otherwise():
     on = replace(config, bilevel=replace(config.bilevel, after_budget=True))
     assert not due(config, 500_000, 250).outer
     assert due(on, 500_000, 250).outer
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("name", PRESETS)
-def test_every_preset_is_sound_and_survives_json(method: str, name: str):
-    for task in PAPER:
-        config = check(preset(name, task, method))
-        assert from_json(to_json(config)) == config
-
-
-def test_an_unknown_key_is_named():
-    data = to_json(preset("paper", "door-lock", "m-senior"))
-    data["queries"]["bugdet"] = 3
-    with pytest.raises(BadInput, match="bugdet"):
-        from_json(data)

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from senior.parts import load
-from senior.select import RULES, Context, Selection, motion_distinction, probability_second
+from senior.select import (
+    RULES,
+    Context,
+    Selection,
+    disagreement,
+    entropy,
+    kcenter,
+    motion_distinction,
+    probability_second,
+)
 from senior.select.motion_distinction import MotionDistinction, axes, distinction, motion_sum
 from senior.types import EnvSpec, Pairs
 
@@ -33,7 +43,7 @@ def context_of(positions: np.ndarray, summed: np.ndarray | None = None) -> Conte
         assert o is pool.observation and a is pool.action
         return summed
 
-    return Context(pool, predict, SPEC, SCALE)
+    return Context(pool, predict, SPEC, SCALE, observation[:0])
 
 
 def strokes(seed: int, pairs: int, steps: int = H) -> np.ndarray:
@@ -279,3 +289,63 @@ def test_an_oriented_axis_is_a_unit_vector_along_the_displacement():
     displacement = (segment[:, -1] - segment[:, 0]).astype(np.float64)
     assert ((found * displacement).sum(axis=1) >= 0).all()
     np.testing.assert_allclose(found, [axis_by_hand(s) for s in segment], atol=1e-4)
+
+
+# k-center.
+
+
+def context_with(points: np.ndarray, labelled: np.ndarray, summed: np.ndarray | None = None) -> Context:
+    """A pool whose pairs have those observations ``[P, 2, H, o]``, and labelled pairs with theirs."""
+    context = context_of(strokes(0, len(points), points.shape[2]), summed)
+    pool = Pairs(points, *context.pool[1:])
+    return replace(context, pool=pool, labelled=labelled, predict=lambda o, a: summed)
+
+
+def farthest_by_hand(points: np.ndarray, labelled: np.ndarray, n: int) -> tuple[list[int], list[float]]:
+    chosen: list[int] = []
+    distances: list[float] = []
+    for _ in range(n):
+        known = [*labelled, *points[chosen]]
+        gaps = [
+            min((float(np.linalg.norm((point - other).ravel())) for other in known), default=np.inf)
+            if i not in chosen
+            else -np.inf
+            for i, point in enumerate(points)
+        ]
+        chosen.append(int(np.argmax(gaps)))
+        distances.append(max(gaps))
+    return chosen, distances
+
+
+@pytest.mark.parametrize("seen", [0, 1, 9])
+def test_k_center_takes_the_pair_farthest_from_all_that_were_labelled_or_chosen(seen: int):
+    points = RNG(1).normal(size=(20, 2, 4, O)).astype(np.float32)
+    labelled = RNG(2).normal(size=(seen, 2, 4, O)).astype(np.float32)
+    chosen = kcenter.kcenter(RNG(0), context_with(points, labelled), 6)
+    index, distance = farthest_by_hand(points.astype(float), labelled.astype(float), 6)
+    assert chosen.index.tolist() == index
+    np.testing.assert_allclose(chosen.scores["distance"], distance, rtol=1e-6)
+
+
+def test_k_center_chooses_a_copy_only_when_nothing_else_is_left_and_never_the_same_row():
+    points = np.repeat(RNG(3).normal(size=(3, 1, 1, O)), 2, axis=0) * np.ones((6, 2, 4, O))
+    chosen = kcenter.kcenter(RNG(0), context_with(points.astype(np.float32), points[:0].astype(np.float32)), 6)
+    assert sorted(chosen.index.tolist()) == list(range(6))
+    assert sorted(index // 2 for index in chosen.index[:3].tolist()) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("rule", ["disagreement", "entropy"])
+def test_the_mixtures_of_k_center_look_only_at_the_five_times_n_best(rule: str):
+    points = RNG(4).normal(size=(30, 2, 4, O)).astype(np.float32)
+    summed = RNG(5).normal(0, 2, (3, 30, 2))
+    context = context_with(points, points[:2] + 1, summed)
+    mixture, alone = {
+        "disagreement": (kcenter.kcenter_disagreement, disagreement.disagreement),
+        "entropy": (kcenter.kcenter_entropy, entropy.entropy),
+    }[rule]
+    chosen, single = mixture(RNG(0), context, 3), alone(RNG(0), context, 15)
+    best = single.index
+    index, _ = farthest_by_hand(points[best].astype(float), context.labelled.astype(float), 3)
+    assert chosen.index.tolist() == best[index].tolist()
+    scores = dict(zip(best.tolist(), single.scores[rule].tolist(), strict=True))
+    np.testing.assert_allclose(chosen.scores[rule], [scores[i] for i in chosen.index.tolist()])

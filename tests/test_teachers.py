@@ -1,15 +1,21 @@
-"""Scripted teachers on segments made by hand."""
+"""Scripted teachers, on segments made by hand and against what chance should give."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 
-from senior.teachers.scripted import Oracle
-from senior.types import Pairs, Preferred, Query
+from senior import parts
+from senior.config import Answering, Config
+from senior.teachers.scripted import TEACHERS, Numbers, Scripted, judge
+from senior.types import BadInput, Pairs, Preferred, Query
+
+MANY = 100_000
 
 
-def query_of(reward: object) -> Query:
+def query_of(reward: object, reward_per_step: float = 0.0) -> Query:
     """A query whose pairs have those true rewards ``[P, 2, H]``; everything else says the opposite."""
     given = np.asarray(reward, np.float32)
     p, _, _ = given.shape
@@ -18,7 +24,16 @@ def query_of(reward: object) -> Query:
         Pairs(-given[..., None], -given[..., None], given, nothing, nothing),
         scores={"m": np.zeros(p)},
         prediction=np.full(p, 0.5),
+        reward_per_step=reward_per_step,
     )
+
+
+def answers_of(name: str, reward: object, reward_per_step: float = 0.0) -> list[int | None]:
+    """What a named teacher says to pairs made by hand."""
+    teacher = Scripted(TEACHERS[name], seed=3)
+    query = query_of(reward, reward_per_step)
+    teacher.ask(list(range(1, len(query.pairs) + 1)), query)
+    return teacher.collect().labels
 
 
 @pytest.mark.parametrize(
@@ -35,14 +50,114 @@ def query_of(reward: object) -> Query:
     ],
 )
 def test_the_oracle_prefers_the_higher_sum_of_true_rewards(first: list, second: list, label: Preferred):
-    oracle = Oracle()
-    oracle.ask([7], query_of([[first, second]]))
-    answers = oracle.collect()
-    assert (answers.ids, answers.labels) == ([7], [label])
+    assert answers_of("oracle", [[first, second]]) == [label]
+
+
+def test_the_myopic_teacher_weighs_late_steps_more_and_the_last_one_whole():
+    early, late = [3.0, 0, 0], [0, 0, 2.5]
+    assert answers_of("oracle", [[early, late]]) == [Preferred.FIRST]
+    assert answers_of("myopic", [[early, late]]) == [Preferred.SECOND]  # 3 * 0.81 = 2.43
+    assert answers_of("myopic", [[[0, 0, 1.0], [0, 1 / 0.9 - 1e-3, 0]]]) == [Preferred.FIRST]
+    assert answers_of("myopic", [[[0, 0, 1.0], [0, 1 / 0.9 + 1e-3, 0]]]) == [Preferred.SECOND]
+
+
+def test_thresholds_are_shares_of_what_a_segment_earned_on_average_once():
+    """Two steps at 5 each make an average of 10; a tenth of it is 1, a hundredth would be the public code's."""
+    pairs = [[[0.6, 0.3], [0.2, 0.2]], [[0.6, 0.5], [0.2, 0.2]], [[0.2, 0.0], [0.9, 0.0]]]
+    assert answers_of("skip", pairs, 5.0) == [None, Preferred.FIRST, None]
+    close = [[[3.0, 0], [3.9, 0]], [[3.0, 0], [4.2, 0]], [[3.9, 0], [3.0, 0]]]
+    assert answers_of("equal", close, 5.0) == [Preferred.EQUAL, Preferred.SECOND, Preferred.EQUAL]
+
+
+def test_nothing_is_skipped_while_nothing_was_earned():
+    assert answers_of("skip", [[[0.0, 0.0], [0.0, 0.0]]], 0.0) == [Preferred.FIRST]
+    assert answers_of("skip", [[[-9.0, 0.0], [-8.0, 0.0]]], -5.0) == [Preferred.SECOND]
+
+
+# Against chance: 100,000 queries each, within three standard deviations of what the closed form gives.
+
+
+def random_pairs(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(0.5, 0.3, (MANY, 2, 4))
+
+
+def assert_share(hits: np.ndarray, probability: np.ndarray | float) -> None:
+    """``hits`` of independent trials happened as often as their probabilities say."""
+    p = np.broadcast_to(probability, hits.shape)
+    deviation = math.sqrt(np.sum(p * (1 - p)))
+    assert abs(hits.sum() - p.sum()) <= 3 * deviation, (hits.mean(), p.mean())
+
+
+def judged(reward: np.ndarray, numbers: Numbers, average: float = 2.0) -> np.ndarray:
+    """Answers as an array, NaN where a pair was skipped."""
+    return np.array(judge(reward, numbers, average, np.random.default_rng(11)), float)
+
+
+def truth(reward: np.ndarray, foresight: float = 1.0) -> np.ndarray:
+    weights = foresight ** np.array([3.0, 2, 1, 0])
+    return np.array([sum(w * r for w, r in zip(weights, one, strict=True)) for one in reward[:, 1] - reward[:, 0]])
+
+
+def test_the_oracle_and_the_myopic_teacher_never_err():
+    reward = random_pairs(0)
+    assert np.array_equal(judged(reward, TEACHERS["oracle"]), truth(reward) > 0)
+    assert np.array_equal(judged(reward, TEACHERS["myopic"]), truth(reward, 0.9) > 0)
+
+
+def test_the_mistaken_teacher_errs_at_its_rate_and_no_matter_how_clear_the_case():
+    reward = random_pairs(1)
+    gap = truth(reward)
+    wrong = judged(reward, TEACHERS["mistake"]) != (gap > 0)
+    assert_share(wrong, 0.1)
+    clear = np.abs(gap) > 1
+    assert 1000 < clear.sum() < MANY - 1000
+    assert_share(wrong[clear], 0.1)
+    assert_share(judged(reward, Numbers(mistake=0.37)) != (gap > 0), 0.37)
+
+
+def test_the_noisy_teacher_answers_by_the_logistic_of_the_advantage():
+    reward = random_pairs(2)
+    gap = truth(reward)
+    for rationality in (1.0, 4.0):
+        second = judged(reward, Numbers(rationality=rationality))
+        expected = 1 / (1 + np.exp(-rationality * gap))
+        assert_share(second, expected)
+        for low, high in ((-9, -0.5), (-0.5, 0), (0, 0.5), (0.5, 9)):
+            held = (gap > low) & (gap <= high)
+            assert_share(second[held], expected[held])
+
+
+def test_the_skipping_and_the_equal_teacher_leave_out_and_mark_exactly_what_their_thresholds_say():
+    reward = random_pairs(3)
+    total = reward.sum(axis=-1)
+    skipped = np.isnan(judged(reward, Numbers(skip=0.8), average=2.0))
+    assert np.array_equal(skipped, total.max(axis=1) <= 1.6)
+    assert 1000 < skipped.sum() < MANY - 1000
+    equal = judged(reward, TEACHERS["equal"], average=2.0) == Preferred.EQUAL
+    assert np.array_equal(equal, np.abs(total[:, 0] - total[:, 1]) < 0.2)
+    # the difference of two sums of four normals of deviation 0.3 is normal with deviation 0.3 sqrt(8)
+    assert_share(equal, math.erf(0.2 / (0.3 * math.sqrt(8) * math.sqrt(2))))
+
+
+def test_a_mixture_has_all_five_at_once():
+    """Noise and mistakes are independent; equal pairs are equal whatever was said; skipped ones are gone."""
+    reward = random_pairs(4)
+    total, gap = reward.sum(axis=-1), truth(reward, 0.8)
+    label = judged(reward, Numbers(rationality=2.0, foresight=0.8, mistake=0.2, skip=0.6, equal=0.1), average=2.0)
+    skipped = total.max(axis=1) <= 1.2
+    marked = (np.abs(total[:, 0] - total[:, 1]) < 0.2) & ~skipped
+    assert np.array_equal(np.isnan(label), skipped)
+    assert np.array_equal(label == Preferred.EQUAL, marked)
+    rest = ~skipped & ~marked
+    second = 1 / (1 + np.exp(-2 * gap[rest]))
+    assert_share(label[rest], 0.8 * second + 0.2 * (1 - second))
+
+
+# As a teacher.
 
 
 def test_answers_come_once_in_the_order_of_asking_under_the_numbers_asked():
-    oracle = Oracle()
+    oracle = Scripted()
     assert oracle.collect().ids == []
     oracle.ask([4, 9], query_of([[[1], [2]], [[2], [1]]]))
     oracle.ask([11], query_of([[[0], [5]]]))
@@ -55,7 +170,50 @@ def test_answers_come_once_in_the_order_of_asking_under_the_numbers_asked():
     assert oracle.collect().ids == [12]
 
 
-def test_two_oracles_share_no_answers():
-    one, other = Oracle(), Oracle()
+def test_two_teachers_share_no_answers():
+    one, other = Scripted(), Scripted()
     one.ask([1], query_of([[[1], [2]]]))
     assert other.collect().ids == [] and one.collect().ids == [1]
+
+
+def test_what_is_random_depends_on_the_run_and_on_the_pairs_number_alone():
+    reward = random_pairs(5)[:500]
+
+    def said(seed: int, first: int) -> list[int | None]:
+        teacher = Scripted(TEACHERS["noisy"], seed)
+        teacher.ask([99], query_of(reward[:1]))  # what was asked before does not matter
+        teacher.ask(list(range(first, first + 500)), query_of(reward))
+        return teacher.collect().labels[1:]
+
+    assert said(0, 1) == said(0, 1)
+    assert said(0, 1) != said(1, 1)
+    assert said(0, 1) != said(0, 501)
+
+
+# From a configuration.
+
+
+@pytest.mark.parametrize("name", TEACHERS)
+def test_a_named_teacher_has_its_own_numbers_and_those_asked_for(name: str):
+    teacher = parts.teacher(Config(teacher=name, seed=4))
+    assert isinstance(teacher, Scripted)
+    assert (teacher.numbers, teacher.seed) == (TEACHERS[name], 4)
+    mixed = parts.teacher(Config(teacher=name, answering=Answering(mistake=0.2, equal=0.0)))
+    assert isinstance(mixed, Scripted)
+    assert mixed.numbers == TEACHERS[name]._replace(mistake=0.2, equal=0.0)
+
+
+def test_the_numbers_are_resolved_and_resolving_again_changes_nothing():
+    config = Config(teacher="mistake", answering=Answering(skip=0.3))
+    resolved = parts.answering(config)
+    assert resolved == Answering(rationality=-1, foresight=1, mistake=0.1, skip=0.3, equal=0)
+    assert parts.answering(Config(teacher="mistake", answering=resolved)) == resolved
+
+
+def test_numbers_of_a_scripted_teacher_are_refused_for_another():
+    own = Config(teacher=f"{__name__}:Scripted", answering=Answering(mistake=0.2))
+    with pytest.raises(
+        BadInput, match=r"--mistake is a number of scripted teachers, and tests\.test_teachers:Scripted"
+    ):
+        parts.answering(own)
+    assert parts.answering(Config(teacher=f"{__name__}:Scripted")) == Answering()

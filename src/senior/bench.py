@@ -22,7 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from senior import program, rundir
-from senior.config import Config, Pretraining, check
+from senior.checks import check
+from senior.config import Config, Pretraining
 from senior.learner import Learner
 from senior.loop import Training
 from senior.methods import METHODS

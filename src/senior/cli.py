@@ -19,7 +19,7 @@ import tyro
 from tqdm import tqdm
 
 from senior.config import Config
-from senior.presets import preset, quick_changes
+from senior.presets import preset, quick_changes, release, with_budget
 from senior.types import BadInput
 
 DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -147,18 +147,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _train(arguments: list[str]) -> int:
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    for name, default in (("task", "door-lock"), ("method", "m-senior"), ("preset", "paper"), ("env", None)):
+    starts = {"task": "door-lock", "method": "m-senior", "preset": "paper", "env": None, "compat": "none"}
+    for name, default in starts.items():
         first.add_argument(f"--{name}", default=default)
+    first.add_argument("--budget", type=int)
     try:
         known, _ = first.parse_known_args(arguments)
     except argparse.ArgumentError as error:
-        raise BadInput(f"{error.argument_name} needs a value.") from error
+        needs = "a whole number" if "invalid int" in str(error) else "a value"
+        raise BadInput(f"{error.argument_name} needs {needs}.") from error
     start = preset(known.preset, known.task, known.method)
+    if known.budget is not None:
+        start = with_budget(start, known.budget)
+    if known.compat == "release":
+        start = release(start)
     text = (
-        "Train one run, or several in one program. Defaults below are those of the --task, --method and --preset "
-        "given. The quick preset is for a CPU and changes from the paper's numbers (here those for door-close): "
-        + quick_changes().replace("\n", "; ")
-        + "."
+        "Train one run, or several in one program. Defaults below are those of the --task, --method, --preset, "
+        "--budget and --compat given. The quick preset is for a CPU and changes from the paper's numbers (here those "
+        "for door-close): " + quick_changes().replace("\n", "; ") + "."
     )
     options = parse(TrainOptions, arguments, TrainOptions(config=start), "train", text)
     from senior import program
@@ -241,11 +247,19 @@ def _methods(arguments: list[str]) -> int:
     parse(NoOptions, arguments, None, "methods")
     from senior.methods import METHODS
 
-    rows = [
-        [cell if cell != "none" else "-" for cell in (row.name, row.select, row.explore, row.mix, row.outer)]
-        + [f"{preset('paper', 'door-lock', row.name).reward.members} members" if row.learns_reward else "true reward"]
-        for row in METHODS.values()
-    ]
+    rows = []
+    for row in METHODS.values():
+        config = preset("paper", "door-lock", row.name)
+        mixes = {
+            "uniform": "uniform",
+            "curiosity": f"{config.pge.share:.0%} curiosity",
+            "recent": f"{config.qpa.share:.0%} recent",
+        }
+        outer = f"{row.outer} every {config.bilevel.every:,} steps"
+        reward = config.reward
+        fit = f"{reward.members} member{'s' if reward.members > 1 else ''}" + (", snippets" if reward.snippets else "")
+        cells = (row.name, row.select, row.explore, mixes[row.mix], outer if row.outer != "none" else "none")
+        rows.append([cell if cell != "none" else "-" for cell in cells] + [fit if row.learns_reward else "true reward"])
     print(table(("method", "select", "explore", "replay mix", "outer step", "reward fit"), rows))
     return DONE
 

@@ -7,7 +7,6 @@ Every number that a paper leaves open is a named field here, with the reading we
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -35,6 +34,8 @@ class Networks:
     """Hidden layers of the actor and of each critic."""
     width: int = 256
     """Units of each hidden layer of the actor and of each critic."""
+    layer_norm: bool = False
+    """Normalise the hidden layers of the critics before their activation. The papers do not."""
     reward_layers: int = 3
     """Hidden layers of each member of the reward ensemble."""
     reward_width: int = 256
@@ -98,6 +99,12 @@ class Reward:
     """Pairs of one gradient step."""
     stop_accuracy: float = 0.97
     """A session's fit ends after an epoch with more training accuracy than this."""
+    snippets: int = 0
+    """Random windows that stand for each pair in a fit (QPA's data augmentation, tau). 0: the whole segments."""
+    snippet_min: int = 35
+    """Fewest steps of such a window."""
+    snippet_max: int = 45
+    """Most steps of such a window."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +112,7 @@ class Queries:
     """Which segments can be asked about, and when."""
 
     budget: int = 250
-    """Pairs asked in the whole run; a skipped pair counts too."""
+    """Pairs asked in the whole run; a skipped pair counts too. --per-session grows with it unless it is given."""
     per_session: int = 5
     """Pairs asked per session (M)."""
     every: Annotated[int, _flag("session-every")] = 5000
@@ -113,7 +120,8 @@ class Queries:
     segment: int = 50
     """Steps of a segment (H)."""
     episodes: Annotated[int, _flag("candidate-episodes")] = 100
-    """How many of the latest complete episodes that are longer than a segment pairs are cut from."""
+    """How many of the latest complete episodes that are longer than a segment pairs are cut from. With --select
+    policy_aligned it is --qpa.episodes instead."""
     pool: int = 10
     """Candidate pairs per asked pair: the pool p has this times M pairs."""
 
@@ -130,6 +138,8 @@ class MotionDistinction:
     """What the motion score sums: the density (paper) or its logarithm (public code)."""
     axis: Annotated[Literal["oriented", "raw", "absolute"], _flag("axis")] = "oriented"
     """Sign of a segment's principal axis: along its displacement, as the solver returns it, or ignored."""
+    scores: Literal["own", "mirrored"] = "own"
+    """Whose scores a pair is chosen by: its own, or those of the pair at the other end of the list (public code)."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +160,16 @@ class PreferenceGuided:
     """Decay rate of the weight (rho)."""
     clock: Annotated[Literal["refresh", "env_step", "since_pretrain"], _flag("beta-clock")] = "refresh"
     """What t counts in beta_t: refreshes, environment steps, or steps since pre-training."""
+    equal: Literal["left_out", "second"] = "left_out"
+    """What a pair called equal adds to the preferred positions: nothing while there are others, or its second segment
+    (public code)."""
+    relabel: bool = True
+    """Score the curiosity buffer's rows anew whenever the replay is. The public code keeps them as they were drawn."""
+    rest: Literal["all", "older"] = "all"
+    """Rows that fill the batch up: from all of the replay, or, rounded down, from those older than the last refresh
+    that are not in the curiosity buffer (public code)."""
+    refresh_with_outer: bool = True
+    """Refresh at steps with an outer step too. The public code leaves those refreshes out."""
 
 
 @dataclass(frozen=True)
@@ -164,6 +184,45 @@ class Bilevel:
     """Adam of the outer step: the reward fit's own (public code) or another."""
     after_budget: bool = False
     """Go on with outer steps when the budget is spent (the paper's Algorithm 1 read literally)."""
+    batch: Literal["uniform", "update"] = "uniform"
+    """Batch of the inner step: one of its own from the whole replay (Algorithm 1), or that of the step's update
+    (public code)."""
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """RUNE's bonus."""
+
+    beta: float = 0.05
+    """Weight of the bonus at step 0 (beta_0)."""
+    decay: float = 1e-5
+    """Decay rate of the weight per environment step (rho)."""
+
+
+@dataclass(frozen=True)
+class PolicyAligned:
+    """QPA's policy-aligned buffer."""
+
+    episodes: int = 30
+    """How many of the latest episodes are the policy's own (N_pa): queries come from them."""
+    share: float = 0.5
+    """Share of a batch drawn from their steps, while there is budget (omega)."""
+
+
+@dataclass(frozen=True)
+class Answering:
+    """The five numbers of a scripted teacher (B-Pref). Left out: those of the named teacher, else a perfect one's."""
+
+    rationality: float | None = None
+    """Inverse temperature of random answers; -1: always the better one (beta)."""
+    foresight: float | None = None
+    """Discount that weighs a segment's earlier steps less; 1: all alike (gamma)."""
+    mistake: float | None = None
+    """Probability of the opposite answer (epsilon_mistake)."""
+    skip: float | None = None
+    """Pairs whose better segment earns less than this share of the recent average are skipped (epsilon_skip)."""
+    equal: float | None = None
+    """Pairs that differ by less than this share of the recent average are called equal (epsilon_equal)."""
 
 
 @dataclass(frozen=True)
@@ -183,14 +242,17 @@ class Config:
     task: str = "door-lock"
     """A task of `senior tasks`. With --env it only says whose numbers the preset takes."""
     method: Annotated[Method, _FLAT] = field(default_factory=Method)
-    preset: Literal["paper", "quick"] = "paper"
-    """paper: the numbers of the paper. quick: see below."""
+    preset: Literal["paper", "quick", "qpa_original"] = "paper"
+    """paper: the numbers of the paper. quick: see below. qpa_original: QPA's own networks, batch and rates."""
     seed: int = 0
     """Seed of everything random in the run."""
     steps: int = 1_000_000
     """Environment steps."""
+    compat: Literal["none", "release"] = "none"
+    """release: m-senior as its authors' public code behaves, where that differs from the paper."""
     teacher: str = "oracle"
-    """Who answers: oracle (compares true returns), or module:Name."""
+    """Who answers: oracle (compares true returns), mistake, noisy, skip, equal, myopic, or module:Name."""
+    answering: Annotated[Answering, _FLAT] = field(default_factory=Answering)
     env: str | None = None
     """Any Gymnasium environment with Box spaces instead of a task: module:Name or a registered id."""
     position: str | None = None
@@ -207,6 +269,8 @@ class Config:
     mds: MotionDistinction = field(default_factory=MotionDistinction)
     pge: PreferenceGuided = field(default_factory=PreferenceGuided)
     bilevel: Bilevel = field(default_factory=Bilevel)
+    rune: Disagreement = field(default_factory=Disagreement)
+    qpa: PolicyAligned = field(default_factory=PolicyAligned)
     evaluation: Evaluation = field(default_factory=Evaluation)
     replay_capacity: int | None = None
     """Transitions kept; left out: all steps of the run."""
@@ -218,6 +282,11 @@ class Config:
     """Where to compute. gpu: an error if there is none."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Number format of the networks. bfloat16 is not offered yet."""
+
+    @property
+    def window(self) -> int:
+        """How many of the latest complete episodes candidate pairs are cut from."""
+        return self.qpa.episodes if self.method.select == "policy_aligned" else self.queries.episodes
 
     @property
     def capacity(self) -> int:
@@ -260,118 +329,3 @@ def differences(one: Any, other: Any, prefix: str = "") -> list[tuple[str, Any, 
         elif left != right:
             found.append((prefix + entry.name, left, right))
     return found
-
-
-def _require(condition: bool, sentence: str) -> None:
-    if not condition:
-        raise BadInput(sentence)
-
-
-def check(config: Config) -> Config:
-    """Refuse a configuration that makes no sense, with one sentence that says why."""
-    queries, row = config.queries, config.method
-    for name, value in (
-        ("--steps", config.steps),
-        ("--per-session", queries.per_session),
-        ("--session-every", queries.every),
-        ("--refresh-every", config.pge.every),
-        ("--outer-every", config.bilevel.every),
-        ("--segment", queries.segment),
-        ("--pool", queries.pool),
-        ("--sac.batch", config.sac.batch),
-        ("--sac.updates", config.sac.updates),
-        ("--sac.target-every", config.sac.target_every),
-        ("--sac.reset-updates", config.sac.reset_updates),
-        ("--reward.members", config.reward.members),
-        ("--reward.batch", config.reward.batch),
-        ("--reward.epochs", config.reward.epochs),
-        ("--networks.layers", config.networks.layers),
-        ("--networks.width", config.networks.width),
-        ("--networks.reward-layers", config.networks.reward_layers),
-        ("--networks.reward-width", config.networks.reward_width),
-        ("--evaluation.every", config.evaluation.every),
-        ("--evaluation.episodes", config.evaluation.episodes),
-        ("--checkpoint-every", config.checkpoint_every),
-        ("--snapshot-every", config.snapshot_every),
-        ("--pretraining.neighbours", config.pretraining.neighbours),
-        ("--pge.capacity", config.pge.capacity),
-        ("--replay-capacity", 1 if config.replay_capacity is None else config.replay_capacity),
-    ):
-        _require(value >= 1, f"{name} must be at least 1, not {value}.")
-    for name, value in (
-        ("--seed", config.seed),
-        ("--pretraining.random-steps", config.pretraining.random_steps),
-        ("--pge.beta", config.pge.beta),
-        ("--bilevel.weight", config.bilevel.weight),
-    ):
-        _require(0 <= value < float("inf"), f"{name} must be 0 or more, not {value}.")
-    _require(config.seed < 2**32, f"--seed must be below {2**32}, not {config.seed}.")
-    _require(queries.episodes >= 2, f"--candidate-episodes must be at least 2, as pairs need, not {queries.episodes}.")
-    for name, number in (
-        ("--bandwidth-mds", config.mds.bandwidth),
-        ("--bandwidth-pge", config.pge.bandwidth),
-        ("--sac.actor-rate", config.sac.actor_rate),
-        ("--sac.critic-rate", config.sac.critic_rate),
-        ("--sac.alpha-rate", config.sac.alpha_rate),
-        ("--sac.initial-alpha", config.sac.initial_alpha),
-        ("--reward.rate", config.reward.rate),
-        ("--length-scale", 1.0 if config.length_scale is None else config.length_scale),
-    ):
-        _require(0 < number < float("inf"), f"{name} must be a positive number, not {number}.")
-    for name, share in (
-        ("--pge.share", config.pge.share),
-        ("--mds.keep", config.mds.keep),
-        ("--pge.decay", config.pge.decay),
-        ("--sac.tau", config.sac.tau),
-        ("--sac.discount", config.sac.discount),
-        ("--sac.rate-end", config.sac.rate_end),
-        ("--reward.stop-accuracy", config.reward.stop_accuracy),
-    ):
-        _require(0 <= share <= 1, f"{name} must lie between 0 and 1, not {share}.")
-    _require(
-        config.precision == "float32",
-        "--precision bfloat16 is not offered yet: its learning curves have not been compared with float32's.",
-    )
-    _require(
-        math.isfinite(config.sac.target_entropy),
-        f"--sac.target-entropy must be a number, not {config.sac.target_entropy}.",
-    )
-    row.check()
-    until, random_steps = config.pretraining.until, config.pretraining.random_steps
-    if not row.learns_reward:
-        _require(until == 0, f"Method {row.name} learns from the true reward, so --pretraining.until must be 0.")
-        return config
-    _require(
-        queries.budget >= queries.per_session,
-        f"The budget of {queries.budget} labels is below one session of {queries.per_session}; "
-        "raise --budget or lower --per-session.",
-    )
-    _require(
-        config.steps > until,
-        f"{config.steps} steps end before the first session at step {until}; raise --steps or lower "
-        "--pretraining.until.",
-    )
-    _require(
-        random_steps >= config.pretraining.neighbours,
-        f"State entropy looks at {config.pretraining.neighbours} neighbours, more than there are after {random_steps} "
-        "random steps; raise --pretraining.random-steps.",
-    )
-    _require(
-        random_steps + 1 < until,
-        f"Pre-training must last beyond its {random_steps} random steps; raise --pretraining.until ({until}).",
-    )
-    _require(
-        config.capacity > until,
-        f"A replay of {config.capacity} rows cannot hold pre-training's {until} steps; raise --replay-capacity.",
-    )
-    if row.explore == "preference_guided":
-        every = config.pge.every
-        others = [("K, --session-every", queries.every), ("the end of pre-training, --pretraining.until", until)]
-        if row.outer == "bilevel":
-            others.append(("N, --outer-every", config.bilevel.every))
-        for name, other in others:
-            _require(
-                other % every == 0,
-                f"Q, --refresh-every {every}, must divide {name} {other} (the paper's Algorithm 1).",
-            )
-    return config

@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from senior import replay as replay_
 from senior.agent import sac
-from senior.agent.networks import MLP
+from senior.agent.networks import MLP, normalised_relu
 from senior.config import Config
-from senior.explore import Bonus, Now, state_entropy
+from senior.explore import Bonus, Now, preference_guided, state_entropy
 from senior.replay import Fact, Replay
 from senior.reward import bilevel, model
 from senior.types import Batch, EnvSpec
@@ -39,6 +39,7 @@ class Purpose(IntEnum):
     SELECT = 9
     SIDES = 10
     SNAPSHOT = 11
+    TEACHER = 12  # senior.teachers.scripted.RANDOM
 
 
 class Numbers(NamedTuple):
@@ -93,6 +94,7 @@ class Learner:
         self.config = config
         self.spec = spec
         self.bonus = bonus
+        self.critic = normalised_relu if config.networks.layer_norm else jax.nn.relu
         self._compiled_init = jax.jit(self._init)
 
     def init(self, seed: int) -> Run:
@@ -152,13 +154,13 @@ class Learner:
         batch = replay_.sample(run.replay, key_batch, self.config.sac.batch)
         deviation, reward = state_entropy.reward(_some(run.entropy), _some(run.deviation), batch.row)
         move = step % self.config.sac.target_every == 0
-        agent, info = sac.update(run.agent, batch, reward, key_update, run.numbers.sac, move)
+        agent, info = sac.update(run.agent, batch, reward, key_update, run.numbers.sac, move, self.critic)
         return run._replace(agent=agent, deviation=deviation), info
 
-    def learn(self, run: Run, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
-        """The ordinary updates of a step."""
+    def learn(self, run: Run, step: Int[Array, ""], recent: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
+        """The ordinary updates of a step; a share of their batches may come from the ``recent`` latest rows."""
         times = self.config.sac.updates
-        return self._updates(run, step, _key(run, Purpose.UPDATE, step), step * times + jnp.arange(times))
+        return self._updates(run, step, _key(run, Purpose.UPDATE, step), step * times + jnp.arange(times), recent)
 
     # Now and then.
 
@@ -166,7 +168,7 @@ class Learner:
         """The end of pre-training: new critics, then the first updates on the learned reward."""
         key_critics, key_updates = jax.random.split(_key(run, Purpose.RENEW, step))
         run = run._replace(agent=sac.renew_critics(run.agent, key_critics))
-        return self._updates(run, step, key_updates, jnp.arange(self.config.sac.reset_updates))
+        return self._updates(run, step, key_updates, jnp.arange(self.config.sac.reset_updates), jnp.int32(0))
 
     def cut(self, run: Run, starts: Int[Array, "p 2"]) -> tuple[Run, tuple[Array, Array, Array]]:
         """Observations, actions and true rewards of segments that begin at those rows of the run."""
@@ -181,7 +183,9 @@ class Learner:
     def fit(self, run: Run, labelled: model.Labelled, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
         """Fit the reward model to all labels and relabel the replay."""
         key = _key(run, Purpose.FIT, step)
-        fitted, info = model.fit(_some(run.model), labelled, key, self.config.reward.batch, run.numbers.fit)
+        reward = self.config.reward
+        snippets = model.Snippets(reward.snippets, reward.snippet_min, reward.snippet_max) if reward.snippets else None
+        fitted, info = model.fit(_some(run.model), labelled, key, reward.batch, run.numbers.fit, snippets)
         return self.relabel(run._replace(model=fitted))[0], info
 
     def on_session(
@@ -191,19 +195,24 @@ class Learner:
         key = _key(run, Purpose.SESSION, step)
         return run._replace(bonus=self.bonus.on_session(run.bonus, key, preferred, count)), None
 
-    def refresh(self, run: Run, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
+    def refresh(self, run: Run, step: Int[Array, ""]) -> tuple[Run, None]:
         """Bring the bonus up to date."""
         key = _key(run, Purpose.REFRESH, step)
-        bonus = self.bonus.on_refresh(run.bonus, key, run.replay, self._now(run, step))
-        return run._replace(bonus=bonus), self.bonus.report(bonus)
+        return run._replace(bonus=self.bonus.on_refresh(run.bonus, key, run.replay, self._now(run, step))), None
 
     def outer(self, run: Run, pairs: bilevel.FirstSteps, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
-        """Meta-Reward-Net's outer step on a uniform batch; relabels the replay."""
-        key_batch, key_value = jax.random.split(_key(run, Purpose.OUTER, step))
-        batch = replay_.sample(run.replay, key_batch, self.config.sac.batch)
+        """Meta-Reward-Net's outer step on a uniform batch, or on that of the step's update; relabels the replay."""
+        if self.config.bilevel.batch == "update":
+            key_batch, key_update = self._nth(_key(run, Purpose.UPDATE, step), step * self.config.sac.updates)
+            batch, key_value = self._draw(run, key_batch, jnp.int32(0)), jax.random.split(key_update)[0]
+        else:
+            key_batch, key_value = jax.random.split(_key(run, Purpose.OUTER, step))
+            batch = replay_.sample(run.replay, key_batch, self.config.sac.batch)
         separate = self.config.bilevel.optimizer == "separate"
         numbers = run.numbers.outer._replace(inner_rate=self._decayed(run, step).critic_rate)
-        fitted, info = bilevel.outer_step(_some(run.model), run.agent, batch, pairs, key_value, numbers, separate)
+        fitted, info = bilevel.outer_step(
+            _some(run.model), run.agent, batch, pairs, key_value, numbers, separate, self.critic
+        )
         return self.relabel(run._replace(model=fitted))[0], info
 
     def measure(self, run: Run) -> tuple[Run, Float[Array, ""]]:
@@ -225,15 +234,29 @@ class Learner:
     def _now(self, run: Run, step: Array) -> Now:
         return Now(step, step - run.numbers.until, run.length_scale)
 
-    def _draw(self, run: Run, key: PRNGKeyArray) -> Batch:
-        size = self.config.sac.batch
+    def _nth(self, key: PRNGKeyArray, nth: Array) -> tuple[PRNGKeyArray, PRNGKeyArray]:
+        """Keys of the batch and of the rest of the ``nth`` update."""
+        key_batch, key_update = jax.random.split(jax.random.fold_in(key, nth))
+        return key_batch, key_update
+
+    def _draw(self, run: Run, key: PRNGKeyArray, recent: Int[Array, ""]) -> Batch:
+        """A batch of the method's mix. ``recent``: how many rows are the latest; 0: none is drawn from them alone."""
+        size, replay = self.config.sac.batch, run.replay
         key_replay, key_other = jax.random.split(key)
-        batch = replay_.sample(run.replay, key_replay, size)
-        if self.config.method.mix == "uniform":
-            return batch
-        rows = jax.random.randint(key_other, (int(self.config.pge.share * size),), 0, self.config.pge.capacity)
-        curious = jax.tree.map(lambda column: column[rows], run.bonus.curiosity)
-        return replay_.mix(batch, curious, run.bonus.ready)
+        match self.config.method.mix:
+            case "curiosity":
+                bonus: preference_guided.State = run.bonus
+                rows = preference_guided.draw(bonus, key_other, int(self.config.pge.share * size))
+                curious = jax.tree.map(lambda column: column[rows], bonus.curiosity)
+                if self.config.pge.rest == "older":
+                    size = len(rows) + int((1 - self.config.pge.share) * size)
+                    return replay_.mix(preference_guided.older(bonus, replay, key_replay, size), curious, bonus.ready)
+                return replay_.mix(replay_.sample(replay, key_replay, size), curious, bonus.ready)
+            case "recent":
+                batch = replay_.sample(replay, key_replay, size)
+                latest = replay_.latest(replay, key_other, int(self.config.qpa.share * size), recent)
+                return replay_.mix(batch, latest, recent > 0)
+        return replay_.sample(replay, key_replay, size)
 
     def _decayed(self, run: Run, step: Array) -> sac.Numbers:
         """SAC's numbers at a step: actor's and critics' rates on their straight line."""
@@ -245,19 +268,20 @@ class Learner:
         )
 
     def _updates(
-        self, run: Run, step: Array, key: PRNGKeyArray, count: Int[Array, " n"]
+        self, run: Run, step: Array, key: PRNGKeyArray, count: Int[Array, " n"], recent: Int[Array, ""]
     ) -> tuple[Run, dict[str, Array]]:
         """Updates one after the other; ``count`` numbers them, which decides whether the targets move."""
         now, numbers = self._now(run, step), self._decayed(run, step)
 
         def one(agent: sac.Agent, nth: Array) -> tuple[sac.Agent, dict[str, Array]]:
-            key_batch, key_update = jax.random.split(jax.random.fold_in(key, nth))
-            batch = self._draw(run, key_batch)
+            key_batch, key_update = self._nth(key, nth)
+            batch = self._draw(run, key_batch, recent)
             paid = self.bonus.value(run.bonus, batch, now)
             reward = batch.learned_reward + paid if self.config.method.learns_reward else batch.reward
             move = nth % self.config.sac.target_every == 0
-            agent, info = sac.update(agent, batch, reward, key_update, numbers, move)
-            return agent, {**info, "bonus_mean": paid.mean(), "batch_reward": reward.mean()}
+            agent, info = sac.update(agent, batch, reward, key_update, numbers, move, self.critic)
+            told = self.bonus.report(run.bonus, batch, now)
+            return agent, {**info, **told, "bonus_mean": paid.mean(), "batch_reward": reward.mean()}
 
         if len(count) == 1:
             agent, info = one(run.agent, count[0])
@@ -276,7 +300,7 @@ class Learner:
     def relabel(self, run: Run) -> tuple[Run, None]:
         """Score every stored transition anew with the reward model, the bonus's copies included."""
         run = run._replace(replay=replay_.relabel(run.replay, lambda o, a: self._score(run, o, a)))
-        if self.config.method.mix != "curiosity":
+        if self.config.method.mix != "curiosity" or not self.config.pge.relabel:
             return run, None
         held = run.bonus.curiosity
         mean, spread = self._score(run, held.observation, held.action)

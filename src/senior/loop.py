@@ -165,7 +165,8 @@ class Training:
         if plans[0].pretrain:
             return self.runs.propose(learner.pretrain, ("agent", "deviation"), self.mask(), steps)
         if plans[0].update:
-            return self.runs.propose(learner.learn, ("agent",), self.mask(), steps)
+            recent = [np.int32(trainee.recent_rows()) for trainee in self.trainees]
+            return self.runs.propose(learner.learn, ("agent",), self.mask(), steps, recent)
         return None
 
     def store(self, step: int, plans: Sequence[Due], happened: Sequence[Step | None], update: Proposal | None) -> None:
@@ -181,8 +182,12 @@ class Training:
             one, plan, trainee = happened[i], plans[i], self.trainees[i]
             trainee.progress.pretraining_updates += plan.pretrain
             trainee.progress.updates += plan.update * trainee.config.sac.updates
-            if one is not None:
-                trainee.record(step, one, returns[i] if one.ended else None, info[i] if one.ended and info else None)
+            if one is None:
+                continue
+            told = info[i] if one.ended and info else {}
+            trainee.record(step, one, returns[i] if one.ended else None, told)
+            if {"beta", "intrinsic_mean"} <= told.keys() and trainee.progress.labels:
+                self.warn(i, "bonus", health.bonus_zero(float(told["beta"]), float(told["intrinsic_mean"])))
 
     # Now and then, one run at a time.
 
@@ -202,11 +207,8 @@ class Training:
             progress.outer_steps += 1
             progress.latest["outer_loss"] = float(info["outer_loss"])
         if plan.refresh:
-            report = {name: float(value) for name, value in self.runs.one(i, learner.refresh, at).items()}
+            self.runs.one(i, learner.refresh, at)
             progress.refreshes += 1
-            progress.latest.update({name: report[name] for name in ("beta", "intrinsic_mean") if name in report})
-            if {"beta", "intrinsic_mean"} <= report.keys():
-                self.warn(i, "bonus", health.bonus_zero(report["beta"], report["intrinsic_mean"]))
         if plan.begin:
             self.runs.one(i, learner.begin, at)
             progress.updates += trainee.config.sac.reset_updates
@@ -236,10 +238,12 @@ class Training:
 
         informed = progress.labels > 0
         rule = trainee.rule if informed and trainee.rule else parts.first_selection()
-        context = Context(pool, predict, trainee.spec, length_scale)
+        labelled = preferences.arrays.observation[: progress.labels]
+        context = Context(pool, predict, trainee.spec, length_scale, labelled)
         chosen = rule(trainee.rng(Purpose.SELECT, step), context, n)
         before = predict(pool.observation, pool.action).mean(axis=0)[chosen.index]
-        query = Query(pool.take(chosen.index), chosen.scores, probability_second(before))
+        asked = pool.take(chosen.index)
+        query = Query(asked, chosen.scores, probability_second(before), trainee.reward_per_step())
 
         sides = trainee.rng(Purpose.SIDES, step).integers(2, size=n)
         ids = preferences.add(query, progress.sessions, step, trainee.config.seed, sides)
@@ -266,7 +270,7 @@ class Training:
         at = np.int32(step)
         info = runs.one(i, learner.fit, trainee.labelled(), at)
         progress.latest.update({name: float(value) for name, value in info.items()})
-        positions, count = preferences.preferred_positions(trainee.spec.position)
+        positions, count = preferences.preferred_positions(trainee.spec.position, trainee.config.pge.equal)
         runs.one(i, learner.on_session, positions, np.int32(count), at)
 
     def judge_predictions(self, i: int, query: Query, labels: Sequence[int | None], informed: bool) -> None:

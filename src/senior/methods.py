@@ -10,7 +10,7 @@ import tyro
 from senior import explore, select
 from senior.types import BadInput
 
-MIXES = ("uniform", "curiosity")
+MIXES = ("uniform", "curiosity", "recent")
 OUTER_STEPS = ("none", "bilevel")
 
 
@@ -21,11 +21,13 @@ class Method:
     name: Annotated[str, tyro.conf.arg(name="method")] = "m-senior"
     """Name of the row that the cells below start from."""
     select: str = "motion_distinction"
-    """Which pairs to ask: uniform, entropy, disagreement, motion_distinction, none, or module:Name."""
+    """Which pairs to ask: uniform, entropy, disagreement, kcenter, kcenter_disagreement, kcenter_entropy,
+    policy_aligned, motion_distinction, none, or module:Name."""
     explore: str = "preference_guided"
-    """Bonus on top of the learned reward: preference_guided, none, or module:Name."""
+    """Bonus on top of the learned reward: disagreement (RUNE), preference_guided (PGE), none, or module:Name."""
     mix: str = "curiosity"
-    """Where batches come from: uniform (the whole replay), curiosity (a share from PGE's curiosity buffer)."""
+    """Where batches come from: uniform (the whole replay), curiosity (a share from PGE's curiosity buffer), recent (a
+    share from the latest episodes while there is budget, QPA)."""
     outer: str = "bilevel"
     """Outer step on the reward model: bilevel (Meta-Reward-Net), none."""
 
@@ -33,6 +35,11 @@ class Method:
     def learns_reward(self) -> bool:
         """False for plain SAC, which sees the true reward and asks nobody."""
         return self.select != "none"
+
+    @property
+    def refreshes(self) -> bool:
+        """Whether there is a bonus that changes every Q steps. RUNE's is made of what the replay holds."""
+        return self.explore not in ("none", "disagreement")
 
     def check(self) -> None:
         """Refuse cells that do not exist or do not go together."""
@@ -49,7 +56,7 @@ class Method:
             for cell, value, idle in (
                 ("an outer step", self.outer, "none"),
                 ("a bonus", self.explore, "none"),
-                ("a curiosity mix", self.mix, "uniform"),
+                ("a mix of sources", self.mix, "uniform"),
             ):
                 if value != idle:
                     raise BadInput(
@@ -74,6 +81,9 @@ METHODS: dict[str, Method] = {
         Method("sac", select="none", explore="none", mix="uniform", outer="none"),
         Method("pebble", select="entropy", explore="none", mix="uniform", outer="none"),
         Method("mrn", select="disagreement", explore="none", mix="uniform", outer="bilevel"),
+        Method("rune", select="disagreement", explore="disagreement", mix="uniform", outer="none"),
+        Method("m-rune", select="disagreement", explore="disagreement", mix="uniform", outer="bilevel"),
+        Method("qpa", select="policy_aligned", explore="none", mix="recent", outer="none"),
         Method(
             "p-senior",
             select="motion_distinction",

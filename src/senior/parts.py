@@ -8,10 +8,10 @@ import sys
 from dataclasses import asdict
 from typing import Any
 
-from senior.config import Config
+from senior.config import Answering, Config
 from senior.explore import BONUSES, Bonus
 from senior.select import RULES, Rule
-from senior.teachers import TEACHERS, Teacher
+from senior.teachers import TEACHERS, Teacher, scripted
 from senior.types import BadInput, EnvSpec
 
 
@@ -48,13 +48,29 @@ def first_selection() -> Rule:
 
 def bonus(config: Config, spec: EnvSpec) -> Bonus:
     """The exploration bonus of a run."""
-    make = load(config.method.explore, BONUSES, "bonus")
-    if config.method.explore != "preference_guided":
-        return make(spec)
-    pge = config.pge
-    return make(spec, pge.capacity, pge.bandwidth, pge.beta, pge.decay, pge.clock)
+    make, pge = load(config.method.explore, BONUSES, "bonus"), config.pge
+    match config.method.explore:
+        case "preference_guided":
+            return make(spec, pge.capacity, pge.bandwidth, pge.beta, pge.decay, pge.clock)
+        case "disagreement":
+            return make(spec, **asdict(config.rune))
+    return make(spec)
+
+
+def answering(config: Config) -> Answering:
+    """The five numbers of a run's teacher: those asked for, else its own. `BadInput` if it is not a scripted one."""
+    asked = {name: value for name, value in asdict(config.answering).items() if value is not None}
+    own = scripted.TEACHERS.get(config.teacher)
+    if own is None:
+        if asked:
+            raise BadInput(f"--{next(iter(asked))} is a number of scripted teachers, and {config.teacher} is none.")
+        return config.answering
+    return Answering(**{**own._asdict(), **asked})
 
 
 def teacher(config: Config) -> Teacher:
     """Who answers in a run."""
-    return load(config.teacher, TEACHERS, "teacher")()
+    make = load(config.teacher, TEACHERS, "teacher")
+    if config.teacher not in scripted.TEACHERS:
+        return make()
+    return make(scripted.Numbers(**asdict(answering(config))), config.seed)

@@ -146,15 +146,16 @@ class Preferences:
             )
         self._read()
 
-    def preferred_positions(self, position: slice) -> tuple[np.ndarray, int]:
+    def preferred_positions(self, position: slice, equal: str = "left_out") -> tuple[np.ndarray, int]:
         """Positions of all preferred segments, ``[capacity * H, d]`` of which the first ``count`` rows are filled.
 
-        Equal pairs are left out; if there is nothing else, both their segments count.
+        Equal pairs are left out; if there is nothing else, both their segments count. ``equal="second"``: their second
+        segment counts, as by accident in the public code.
         """
         observation, _, label, count = self.arrays
         capacity, _, steps, _ = observation.shape
         label = label[:count]
-        decided = label != Preferred.EQUAL
+        decided = (label != Preferred.EQUAL) | (equal == "second")
         chosen = observation[:count][decided, label[decided]]
         if not decided.any():
             chosen = observation[:count].reshape(-1, steps, observation.shape[-1])[:capacity]

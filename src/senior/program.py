@@ -14,7 +14,8 @@ import numpy as np
 from senior import evaluate, parts, rundir
 from senior.agent.networks import MLP
 from senior.checkpoint import Damaged, unpack
-from senior.config import Config, check, load
+from senior.checks import check
+from senior.config import Config, load
 from senior.envs import render
 from senior.envs.vector import AFTERWARDS, Environments, episode_seed
 from senior.learner import Learner, Run, mean_action
@@ -75,7 +76,7 @@ def train(
     check(replace(config, seed=config.seed + seeds - 1))
     watcher = watcher or Quiet()
     device = prepare_device(config.device)
-    config = replace(config, device=device)
+    config = replace(config, device=device, answering=parts.answering(config))
     learner = make_learner(config)
     if config.method.learns_reward and learner.spec.horizon <= config.queries.segment:
         raise BadInput(

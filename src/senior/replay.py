@@ -103,6 +103,12 @@ def sample(replay: Replay, key: PRNGKeyArray, size: int) -> Batch:
     return gather(replay, jax.random.randint(key, (size,), 0, replay.filled))
 
 
+def latest(replay: Replay, key: PRNGKeyArray, size: int, window: Int[Array, ""]) -> Batch:
+    """Uniform over the ``window`` latest rows, with replacement."""
+    ago = jax.random.randint(key, (size,), 0, jnp.clip(window, 1, jnp.maximum(replay.filled, 1)))
+    return gather(replay, (replay.count - 1 - ago) % replay.capacity, Source.RECENT)
+
+
 def mix(first: Batch, other: Batch, use_other: Array | bool) -> Batch:
     """Replace the last rows of ``first`` by all of ``other`` where ``use_other`` is true (traced)."""
     keep = first.row.shape[0] - other.row.shape[0]

@@ -45,14 +45,19 @@ def due(config: Config, step: int, queried: int) -> Due:
     on_time = step == until or (step - until) % queries.every == 0
     session = min(queries.per_session, left) if on_time and left > 0 else 0
     budget_left = left - session > 0
+    outer = (
+        config.method.outer == "bilevel"
+        and step > until
+        and step % config.bilevel.every == 0
+        and (budget_left or config.bilevel.after_budget)
+    )
     return Due(
         random=False,
         session=session,
-        outer=config.method.outer == "bilevel"
-        and step > until
-        and step % config.bilevel.every == 0
-        and (budget_left or config.bilevel.after_budget),
-        refresh=config.method.explore != "none" and (step == until or step % config.pge.every == 0),
+        outer=outer,
+        refresh=config.method.refreshes
+        and (step == until or step % config.pge.every == 0)
+        and (config.pge.refresh_with_outer or not outer),
         begin=step == until,
         pretrain=False,
         update=step > until,
@@ -72,14 +77,30 @@ class Counts(NamedTuple):
 
 
 def plan(config: Config) -> Counts:
-    """Count a run without physics, assuming that every session finds its episodes."""
-    sessions = queried = last = outer = refreshes = pretraining = updates = 0
-    for step in range(config.steps):
+    """Count a run without physics, assuming that every session finds its episodes.
+
+    Only the steps at which something rare can be due are looked at; the others are counted.
+    """
+    last, until, random_steps = config.steps, config.pretraining.until, config.pretraining.random_steps
+    if not config.method.learns_reward:
+        return Counts(0, 0, 0, 0, 0, 0, max(0, last - random_steps - 1) * config.sac.updates)
+    sessions = queried = last_session = outer = refreshes = begun = 0
+    steps = set(range(until, last, config.queries.every))
+    for every in (config.pge.every, config.bilevel.every):
+        steps |= set(range(-(-until // every) * every, last, every))
+    for step in sorted(steps):
         now = due(config, step, queried)
         if now.session:
-            sessions, queried, last = sessions + 1, queried + now.session, step
+            sessions, queried, last_session = sessions + 1, queried + now.session, step
         outer += now.outer
         refreshes += now.refresh
-        pretraining += now.pretrain
-        updates += now.update * config.sac.updates + now.begin * config.sac.reset_updates
-    return Counts(sessions, queried, last, outer, refreshes, pretraining, updates)
+        begun += now.begin
+    return Counts(
+        sessions,
+        queried,
+        last_session,
+        outer,
+        refreshes,
+        pretraining_updates=max(0, min(until, last) - random_steps - 1),
+        updates=max(0, last - until - 1) * config.sac.updates + begun * config.sac.reset_updates,
+    )

@@ -42,6 +42,7 @@ class Progress:
     episode_return: float = 0.0
     episode_success: float | None = None
     recent: list[list[int]] = field(default_factory=list)  # [episode, first row, length] of those pairs are cut from
+    returns: list[list[float]] = field(default_factory=list)  # [true return, length] of the latest ten episodes
     measured: bool = False  # the length scale was taken from the data
     right: list[int] = field(default_factory=list)  # per session, new pairs predicted rightly before the fit
     decided: list[int] = field(default_factory=list)  # of so many
@@ -188,7 +189,7 @@ class Trainee:
 
     # What happened.
 
-    def record(self, step: int, happened: Step, learned_return: Any, info: dict[str, Any] | None) -> None:
+    def record(self, step: int, happened: Step, learned_return: Any, info: dict[str, Any]) -> None:
         """Count a step that was taken at ``step``; at the end of an episode write its row."""
         progress = self.progress
         progress.elapsed += 1
@@ -198,7 +199,7 @@ class Trainee:
         if not happened.ended:
             return
         learned = float(learned_return) if self.config.method.learns_reward else None
-        numbers = {name: float(value) for name, value in (info or {}).items()}
+        numbers = {name: float(value) for name, value in info.items()}
         self.directory.append(
             "train.csv",
             {
@@ -220,7 +221,9 @@ class Trainee:
             progress.learned_returns.append(learned)
         if progress.elapsed > self.config.queries.segment:
             progress.recent.append([progress.episode, step + 1 - progress.elapsed, progress.elapsed])
-            del progress.recent[: -self.config.queries.episodes]
+            del progress.recent[: -self.config.window]
+        progress.returns.append([progress.episode_return, progress.elapsed])
+        del progress.returns[:-10]
         progress.episode += 1
         progress.elapsed, progress.episode_return, progress.episode_success = 0, 0.0, None
 
@@ -242,6 +245,21 @@ class Trainee:
         drawn = rng.integers(len(usable), size=shape)
         start = rng.integers(length[drawn] - queries.segment)
         return (first[drawn] + start).astype(np.int32), episode[drawn], start
+
+    def recent_rows(self) -> int:
+        """How many of the latest rows QPA draws a share of each batch from; 0: none, or not any more.
+
+        As many as its episodes have at their longest, the running one included; only while there is budget.
+        """
+        progress, config = self.progress, self.config
+        if config.method.mix != "recent" or progress.queried >= config.queries.budget:
+            return 0
+        return min(config.qpa.episodes, progress.episode) * self.spec.horizon
+
+    def reward_per_step(self) -> float:
+        """Mean true reward of the latest ten episodes; scripted teachers measure by it."""
+        total, steps = np.sum(self.progress.returns or [[0.0, 1.0]], axis=0)
+        return float(total / steps)
 
     def labelled(self) -> Labelled:
         """All labels so far, in arrays of the budget's size."""

@@ -104,6 +104,7 @@ class Query:
     pairs: Pairs
     scores: dict[str, np.ndarray] = field(default_factory=dict)  # name -> [P], for instance m and d
     prediction: np.ndarray | None = None  # [P] P(second preferred) by the model before it is fitted
+    reward_per_step: float = 0.0  # mean true reward of the latest ten episodes: only for a scripted teacher
 
 
 @dataclass(frozen=True)

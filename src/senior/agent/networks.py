@@ -14,6 +14,13 @@ Tree = TypeVar("Tree")
 Initialiser = Callable[[PRNGKeyArray, int, int], tuple[Array, Array]]
 Activation = Callable[[Array], Array]
 
+
+def normalised_relu(x: Float[Array, "*b n"]) -> Float[Array, "*b n"]:
+    """ReLU of a layer brought to mean 0 and variance 1: layer normalisation (Ba et al. 2016) that learns nothing."""
+    x = x - x.mean(axis=-1, keepdims=True)
+    return jax.nn.relu(x * jax.lax.rsqrt(jnp.mean(x**2, axis=-1, keepdims=True) + 1e-5))
+
+
 adam = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-8)
 """Adam without its learning rate, which is a traced number of the run (see `descend`)."""
 

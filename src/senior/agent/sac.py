@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from senior.agent.networks import MLP, adam, apply_mlp, descend, init_mlp, orthogonal
+from senior.agent.networks import MLP, Activation, adam, apply_mlp, descend, init_mlp, orthogonal
 from senior.types import Batch
 
 LOG_STD_RANGE = (-5.0, 2.0)
@@ -98,27 +98,36 @@ def mean_action(actor: MLP, observation: Float[Array, "*b o"]) -> Float[Array, "
     return jnp.tanh(distribution(actor, observation)[0])
 
 
-def values(critics: MLP, observation: Float[Array, "b o"], action: Float[Array, "b a"]) -> Float[Array, "2 b"]:
-    """Q of both critics."""
+def values(
+    critics: MLP, observation: Float[Array, "b o"], action: Float[Array, "b a"], activation: Activation = jax.nn.relu
+) -> Float[Array, "2 b"]:
+    """Q of both critics; ``activation``: of their hidden layers."""
     x = jnp.concatenate([observation, action], axis=-1)
-    return jax.vmap(lambda one: apply_mlp(one, x, jax.nn.relu)[..., 0])(critics)
+    return jax.vmap(lambda one: apply_mlp(one, x, activation)[..., 0])(critics)
 
 
-def next_value(agent: Agent, batch: Batch, key: PRNGKeyArray) -> Float[Array, " b"]:
+def next_value(
+    agent: Agent, batch: Batch, key: PRNGKeyArray, activation: Activation = jax.nn.relu
+) -> Float[Array, " b"]:
     """min_j Q_j'(s', a') - alpha log pi(a' | s'), with a' drawn from the policy."""
     action, log_prob = sample(agent.actor, batch.next_observation, key)
-    target = values(agent.targets, batch.next_observation, action).min(axis=0)
+    target = values(agent.targets, batch.next_observation, action, activation).min(axis=0)
     return target - jnp.exp(agent.log_alpha) * log_prob
 
 
 def update_critics(
-    agent: Agent, batch: Batch, reward: Float[Array, " b"], key: PRNGKeyArray, numbers: Numbers
+    agent: Agent,
+    batch: Batch,
+    reward: Float[Array, " b"],
+    key: PRNGKeyArray,
+    numbers: Numbers,
+    activation: Activation = jax.nn.relu,
 ) -> tuple[Agent, dict[str, Array]]:
     """One Adam step of both critics towards r + gamma m V(s')."""
-    target = reward + numbers.discount * batch.bootstrap * next_value(agent, batch, key)
+    target = reward + numbers.discount * batch.bootstrap * next_value(agent, batch, key, activation)
 
     def loss_of(critics: MLP) -> tuple[Array, Array]:
-        q = values(critics, batch.observation, batch.action)
+        q = values(critics, batch.observation, batch.action, activation)
         return jnp.mean((q - target) ** 2, axis=1).sum(), q.mean()
 
     (loss, q), gradient = jax.value_and_grad(loss_of, has_aux=True)(agent.critics)
@@ -126,12 +135,14 @@ def update_critics(
     return agent._replace(critics=critics, critic_adam=state), {"critic_loss": loss, "q": q}
 
 
-def update_actor(agent: Agent, batch: Batch, key: PRNGKeyArray, numbers: Numbers) -> tuple[Agent, dict[str, Array]]:
+def update_actor(
+    agent: Agent, batch: Batch, key: PRNGKeyArray, numbers: Numbers, activation: Activation = jax.nn.relu
+) -> tuple[Agent, dict[str, Array]]:
     """One Adam step of the actor on alpha log pi - min_j Q_j."""
 
     def loss_of(actor: MLP) -> tuple[Array, Array]:
         action, log_prob = sample(actor, batch.observation, key)
-        q = values(agent.critics, batch.observation, action).min(axis=0)
+        q = values(agent.critics, batch.observation, action, activation).min(axis=0)
         return jnp.mean(jnp.exp(agent.log_alpha) * log_prob - q), -log_prob.mean()
 
     (loss, entropy), gradient = jax.value_and_grad(loss_of, has_aux=True)(agent.actor)
@@ -155,11 +166,15 @@ def update(
     key: PRNGKeyArray,
     numbers: Numbers,
     move_targets: Array | bool,
+    activation: Activation = jax.nn.relu,
 ) -> tuple[Agent, dict[str, Array]]:
-    """Critics, actor, temperature, and the targets where ``move_targets`` is true, all on one batch."""
+    """Critics, actor, temperature, and the targets where ``move_targets`` is true, all on one batch.
+
+    activation: of the critics' hidden layers.
+    """
     key_critics, key_actor = jax.random.split(key)
-    agent, of_critics = update_critics(agent, batch, reward, key_critics, numbers)
-    agent, of_actor = update_actor(agent, batch, key_actor, numbers)
+    agent, of_critics = update_critics(agent, batch, reward, key_critics, numbers, activation)
+    agent, of_actor = update_actor(agent, batch, key_actor, numbers, activation)
     agent, of_alpha = update_temperature(agent, of_actor["entropy"], batch.action.shape[-1], numbers)
     tau = jnp.where(move_targets, numbers.tau, 0.0)
     targets = jax.tree.map(lambda slow, fast: slow + tau * (fast - slow), agent.targets, agent.critics)

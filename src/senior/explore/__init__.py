@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 BONUSES = {
     "none": "senior.explore.none:NoBonus",
+    "disagreement": "senior.explore.disagreement:Disagreement",
     "preference_guided": "senior.explore.preference_guided:PreferenceGuided",
 }
 
@@ -50,6 +51,6 @@ class Bonus(Protocol):
         """Bonus of every row of the batch, ``[B]``."""
         ...
 
-    def report(self, state: Any) -> dict[str, Array]:
+    def report(self, state: Any, batch: Batch, now: Now) -> dict[str, Array]:
         """Numbers for the log: ``beta``, its weight, and ``intrinsic_mean``, what it weighs; or nothing."""
         ...

@@ -30,5 +30,5 @@ class NoBonus:
     def value(self, state: tuple[()], batch: Batch, now: Now) -> Float[Array, " b"]:
         return jnp.zeros_like(batch.learned_reward)
 
-    def report(self, state: tuple[()]) -> dict[str, Array]:
+    def report(self, state: tuple[()], batch: Batch, now: Now) -> dict[str, Array]:
         return {}

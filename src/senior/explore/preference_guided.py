@@ -32,6 +32,26 @@ class State(NamedTuple):
     preferred: Float[Array, "E d"]
     any_preferred: Bool[Array, ""]
     refreshes: Int[Array, ""]
+    rows: Int[Array, " E"]  # of the replay, ascending, that the buffer was copied from
+    filled: Int[Array, ""]  # rows of the replay at that refresh
+
+
+def draw(state: State, key: PRNGKeyArray, size: int) -> Int[Array, " size"]:
+    """Uniform places in the curiosity buffer, with replacement."""
+    return jax.random.randint(key, (size,), 0, state.intrinsic.shape[0])
+
+
+def older(state: State, replay: Replay, key: PRNGKeyArray, size: int, tries: int = 16) -> Batch:
+    """Rows that were in the replay at the last refresh and are not in the curiosity buffer, as the public code draws.
+
+    The first of ``tries`` uniform draws that is not in the buffer; before the first refresh, and in the rare case that
+    all are, the last draw.
+    """
+    bound = jnp.where(state.ready, state.filled, replay.filled)
+    drawn = jax.random.randint(key, (tries, size), 0, jnp.maximum(bound, 1))
+    place = jnp.minimum(jnp.searchsorted(state.rows, drawn), state.rows.shape[0] - 1)
+    outside = (state.rows[place] != drawn).at[-1].set(True)
+    return replay_.gather(replay, drawn[jnp.argmax(outside, axis=0), jnp.arange(size)])
 
 
 def intrinsic_reward(
@@ -71,6 +91,8 @@ class PreferenceGuided:
             preferred=jnp.zeros((self.capacity, self.spec.position_size)),
             any_preferred=no,
             refreshes=jnp.zeros((), jnp.int32),
+            rows=jnp.full(self.capacity, -1, jnp.int32),
+            filled=jnp.zeros((), jnp.int32),
         )
 
     def on_session(
@@ -82,7 +104,9 @@ class PreferenceGuided:
 
     def on_refresh(self, state: State, key: PRNGKeyArray, replay: Replay, now: Now) -> State:
         """Replace the curiosity buffer and its intrinsic rewards, and move beta_t on."""
-        drawn = replay_.sample(replay, key, self.capacity)._replace(
+        drawn = replay_.sample(replay, key, self.capacity)
+        rows = jnp.sort(drawn.row)
+        drawn = drawn._replace(
             source=jnp.full(self.capacity, Source.CURIOSITY, jnp.int32), row=jnp.arange(self.capacity)
         )
         positions = drawn.observation[:, self.spec.position]
@@ -98,6 +122,8 @@ class PreferenceGuided:
             ready=state.any_preferred,
             beta=self.beta * (1 - self.decay) ** ticks.astype(jnp.float32),
             refreshes=state.refreshes + 1,
+            rows=rows,
+            filled=replay.filled,
         )
 
     def value(self, state: State, batch: Batch, now: Now) -> Float[Array, " b"]:
@@ -105,6 +131,6 @@ class PreferenceGuided:
         paid = batch.source == Source.CURIOSITY
         return jnp.where(paid, state.beta * state.intrinsic[jnp.where(paid, batch.row, 0)], 0.0)
 
-    def report(self, state: State) -> dict[str, Array]:
+    def report(self, state: State, batch: Batch, now: Now) -> dict[str, Array]:
         """beta_t, and the mean intrinsic reward over the curiosity buffer."""
         return {"beta": state.beta, "intrinsic_mean": state.intrinsic.mean()}

@@ -45,6 +45,28 @@ class FitNumbers(NamedTuple):
     stop_accuracy: Float[Array, ""] | float
 
 
+class Snippets(NamedTuple):
+    """QPA's augmentation: random windows that stand for each pair (Hu et al. 2024)."""
+
+    copies: int  # tau
+    shortest: int  # steps
+    longest: int
+
+
+def window_sums(rewards: Float[Array, "b 2 H"], snippets: Snippets, key: PRNGKeyArray) -> Float[Array, "b copies 2"]:
+    """Sums of rewards within random windows: one length per copy for both segments, a start for each.
+
+    The rewards are computed once and summed under masks, instead of computing every copy anew.
+    """
+    pairs, _, steps = rewards.shape
+    key_length, key_start = jax.random.split(key)
+    length = jax.random.randint(key_length, (pairs, snippets.copies, 1), snippets.shortest, snippets.longest + 1)
+    start = jax.random.randint(key_start, (pairs, snippets.copies, 2), 0, steps - length + 1)
+    step = jnp.arange(steps)
+    inside = (step >= start[..., None]) & (step < (start + length)[..., None])  # [b, copies, 2, H]
+    return jnp.einsum("bch,bkch->bkc", rewards, inside.astype(rewards.dtype))
+
+
 def init(key: PRNGKeyArray, members: int, size_in: int, layers: int, width: int) -> RewardModel:
     """A new ensemble; every member from its own key."""
     made = jax.vmap(lambda k: init_mlp(k, size_in, layers, width, 1, fan_in_uniform))(jax.random.split(key, members))
@@ -76,9 +98,17 @@ def cross_entropy(logits: Float[Array, "*n 2"], target: Float[Array, "*n 2"]) ->
 
 
 def fit(
-    model: RewardModel, labelled: Labelled, key: PRNGKeyArray, batch: int, numbers: FitNumbers
+    model: RewardModel,
+    labelled: Labelled,
+    key: PRNGKeyArray,
+    batch: int,
+    numbers: FitNumbers,
+    snippets: Snippets | None = None,
 ) -> tuple[RewardModel, dict[str, Array]]:
     """Fit all members to all labels: up to ``epochs`` passes in mini-batches of ``batch`` pairs.
+
+    snippets: fit to random windows of the segments instead of whole ones; every window counts like a pair, in the
+    loss and in the accuracy.
 
     Every member sees the labels in an order of its own; the members' losses are summed and one Adam step is
     taken per mini-batch. The fit ends after an epoch whose accuracy, measured while it was trained, exceeds
@@ -92,21 +122,26 @@ def fit(
     target = targets(labelled.label)
     decided = jnp.sum((labelled.label != Preferred.EQUAL) & (jnp.arange(capacity) < count))
 
-    def loss_of(members: MLP, rows: Int[Array, "m b"], weight: Float[Array, " b"]) -> tuple[Array, Array]:
+    def loss_of(
+        members: MLP, rows: Int[Array, "m b"], weight: Float[Array, " b"], key: PRNGKeyArray
+    ) -> tuple[Array, Array]:
         """Summed over members, weighted over pairs; and how many predictions were right."""
 
-        def of_member(member: MLP, own: Int[Array, " b"]) -> tuple[Array, Array]:
-            logits = member_reward(member, labelled.observation[own], labelled.action[own]).sum(axis=-1)
-            right = (logits[:, 1] > logits[:, 0]) == (labelled.label[own] == Preferred.SECOND)
-            counted = right & (weight > 0) & (labelled.label[own] != Preferred.EQUAL)
-            return jnp.sum(cross_entropy(logits, target[own]) * weight), counted.sum()
+        def of_member(member: MLP, own: Int[Array, " b"], key: PRNGKeyArray) -> tuple[Array, Array]:
+            reward = member_reward(member, labelled.observation[own], labelled.action[own])
+            logits = window_sums(reward, snippets, key) if snippets else reward.sum(axis=-1)[:, None]  # [b, copies, 2]
+            right = (logits[..., 1] > logits[..., 0]) == (labelled.label[own] == Preferred.SECOND)[:, None]
+            counted = right.mean(axis=1) * ((weight > 0) & (labelled.label[own] != Preferred.EQUAL))
+            losses = cross_entropy(logits, target[own][:, None]).mean(axis=1)
+            return jnp.sum(losses * weight), counted.sum()
 
-        losses, right = jax.vmap(of_member)(members, rows)
+        losses, right = jax.vmap(of_member)(members, rows, jax.random.split(key, n_members))
         return losses.sum(), right.sum()
 
     def epoch(carry: tuple[RewardModel, Array, Array]) -> tuple[RewardModel, Array, Array]:
         model, done, _ = carry
-        draw = jax.random.uniform(jax.random.fold_in(key, done), (n_members, capacity))
+        key_epoch = jax.random.fold_in(key, done)
+        draw = jax.random.uniform(key_epoch, (n_members, capacity))
         order = jnp.argsort(jnp.where(jnp.arange(capacity) < count, draw, jnp.inf), axis=1)
         order = jnp.pad(order, ((0, 0), (0, batch + part)))
 
@@ -118,7 +153,8 @@ def fit(
                 gradient, right = carry
                 rows = jax.lax.dynamic_slice_in_dim(order, i * batch + j * part, part, axis=1)
                 weight = (j * part + jnp.arange(part) < size) / size
-                (_, hits), more = jax.value_and_grad(loss_of, has_aux=True)(model.members, rows, weight)
+                key_part = jax.random.fold_in(key_epoch, 1 + i * batch + j * part)
+                (_, hits), more = jax.value_and_grad(loss_of, has_aux=True)(model.members, rows, weight, key_part)
                 return jax.tree.map(jnp.add, gradient, more), right + hits
 
             nothing = jax.tree.map(jnp.zeros_like, model.members)
@@ -127,7 +163,7 @@ def fit(
             return model._replace(members=members, adam=state), right
 
         batches = (count + batch - 1) // batch
-        model, right = jax.lax.fori_loop(0, batches, minibatch, (model, jnp.zeros((), jnp.int32)))
+        model, right = jax.lax.fori_loop(0, batches, minibatch, (model, jnp.zeros(())))
         return model, done + 1, right / (n_members * jnp.maximum(decided, 1))
 
     def wanted(carry: tuple[RewardModel, Array, Array]) -> Array:

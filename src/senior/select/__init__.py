@@ -18,6 +18,10 @@ RULES = {
     "uniform": "senior.select.uniform:uniform",
     "entropy": "senior.select.entropy:entropy",
     "disagreement": "senior.select.disagreement:disagreement",
+    "kcenter": "senior.select.kcenter:kcenter",
+    "kcenter_disagreement": "senior.select.kcenter:kcenter_disagreement",
+    "kcenter_entropy": "senior.select.kcenter:kcenter_entropy",
+    "policy_aligned": "senior.select.uniform:uniform",  # QPA's rule is its window of episodes (Config.window)
     "motion_distinction": "senior.select.motion_distinction:MotionDistinction",
 }
 
@@ -33,6 +37,8 @@ class Context:
     spec: EnvSpec
     length_scale: float
     """Unit of the bandwidths (metres in Meta-World)."""
+    labelled: np.ndarray
+    """Observations of all labelled pairs so far ``[L, 2, H, o]``."""
 
     @property
     def positions(self) -> np.ndarray:
@@ -58,6 +64,17 @@ def probability_second(summed: np.ndarray) -> np.ndarray:
     """P(second preferred) of every member ``[members, P]`` from summed rewards ``[members, P, 2]`` (Eq. 1)."""
     gap = np.asarray(summed[..., 0] - summed[..., 1], np.float64)
     return 1 / (1 + np.exp(np.clip(gap, -700, 700)))
+
+
+def deviation(probability: np.ndarray) -> np.ndarray:
+    """Population standard deviation over the members ``[members, P] -> [P]``."""
+    return probability.std(axis=0)
+
+
+def binary_entropy(probability: np.ndarray) -> np.ndarray:
+    """Mean over the members of the entropy of each prediction, in nats: ``[members, P] -> [P]``."""
+    p = np.clip(probability, 1e-12, 1 - 1e-12)
+    return -(p * np.log(p) + (1 - p) * np.log1p(-p)).mean(axis=0)
 
 
 def highest(score: np.ndarray, n: int, name: str) -> Selection:

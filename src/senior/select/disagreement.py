@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from senior.select import Context, Selection, highest, probability_second
+from senior.select import Context, Selection, deviation, highest, probability_second
 
 
 def disagreement(rng: np.random.Generator, context: Context, n: int) -> Selection:
     """Top ``n`` by the population standard deviation over members."""
     p = probability_second(context.predict(context.pool.observation, context.pool.action))
-    return highest(p.std(axis=0), n, "disagreement")
+    return highest(deviation(p), n, "disagreement")

@@ -54,14 +54,19 @@ class MotionDistinction:
     bandwidth: float = 0.05
     density_sum: str = "density"
     axis: str = "oriented"
+    scores: str = "own"
 
     def __call__(self, rng: np.random.Generator, context: Context, n: int) -> Selection:
-        """``n`` pairs of smallest d among the ``keep`` share of the pool with the highest m."""
+        """``n`` pairs of smallest d among the ``keep`` share of the pool with the highest m.
+
+        Mirrored scores are the public code's: in both stages a pair stands for the one at the other end of the list.
+        """
+        turn = slice(None, None, -1 if self.scores == "mirrored" else 1)
         positions = context.positions
         total = motion_sum(positions, self.bandwidth * context.length_scale, self.density_sum)
-        kept = np.argsort(total, kind="stable")[: max(n, int(len(total) * self.keep))]
+        kept = np.argsort(total[turn], kind="stable")[: max(n, int(len(total) * self.keep))]
         d = distinction(positions[kept], self.axis, STILL * context.length_scale**2)
-        best = np.argsort(d, kind="stable")[:n]
+        best = np.argsort(d[turn], kind="stable")[:n]
         # With log densities the sum is not the inverse of anything: the score is then its negative.
         motion = -total if self.density_sum == "log" else 1 / total
         return Selection(kept[best], {"m": motion[kept[best]], "d": d[best]})

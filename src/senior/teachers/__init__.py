@@ -1,15 +1,17 @@
 """Who answers. ``ask`` and ``collect`` are two calls, for people take their time; as yet, all must answer at once.
 
-A scripted teacher is a new file here and a line in `TEACHERS`; a third party's is named ``module:Name``.
+A teacher is a new file here and a line in `TEACHERS`; a third party's is named ``module:Name`` and built without
+arguments.
 """
 
 from __future__ import annotations
 
 from typing import Protocol
 
+from senior.teachers import scripted
 from senior.types import Answers, Query
 
-TEACHERS = {"oracle": "senior.teachers.scripted:Oracle"}
+TEACHERS = dict.fromkeys(scripted.TEACHERS, "senior.teachers.scripted:Scripted")
 
 
 class Teacher(Protocol):
