@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from senior.config import SAC, Bilevel, Config, Evaluation, Networks, PreferenceGuided, Pretraining, Queries, Reward
+from senior.config import SAC, Bilevel, Config, Evaluation, Networks, PreferenceGuided, Pretraining, Queries
 from senior.presets import preset
 
 NETWORKS = Networks(layers=1, width=32, reward_layers=1, reward_width=32)
@@ -18,6 +18,7 @@ NETWORKS = Networks(layers=1, width=32, reward_layers=1, reward_width=32)
 def small(method: str = "m-senior", task: str = "point", **changes: Any) -> Config:
     config = preset("paper", task, method)
     learns = config.method.learns_reward
+    windows = {"snippet_min": 7, "snippet_max": 9} if config.reward.snippets else {}
     config = replace(
         config,
         steps=2000,
@@ -25,7 +26,7 @@ def small(method: str = "m-senior", task: str = "point", **changes: Any) -> Conf
         sac=SAC(batch=64, actor_rate=3e-3, critic_rate=3e-3, alpha_rate=3e-3, tau=0.02, discount=0.9, reset_updates=20),
         pretraining=Pretraining(random_steps=100, until=400 if learns else 0),
         queries=Queries(budget=35, per_session=10, every=200, segment=10, episodes=20, pool=10),
-        reward=Reward(epochs=50, rate=3e-3, batch=16),
+        reward=replace(config.reward, epochs=50, rate=3e-3, batch=16, **windows),
         pge=PreferenceGuided(capacity=100, every=100),
         bilevel=Bilevel(every=200),
         evaluation=Evaluation(every=500, episodes=5),

@@ -14,7 +14,6 @@ from senior.config import (
     Bilevel,
     Config,
     Evaluation,
-    MotionDistinction,
     Networks,
     Pretraining,
     Reward,
@@ -77,11 +76,11 @@ def _qpa_reward(reward: Reward, segment: int) -> Reward:
 def quick(task: str, row: Method) -> Config:
     """For a CPU: one policy in minutes, with the same algorithm and other numbers (docs/methods.md says why)."""
     config = paper(task, row)
-    small = Networks(layers=2, width=128, reward_layers=2, reward_width=128)
+    small = Networks(layers=2, width=128, reward_layers=2, reward_width=128, layer_norm=True)
     config = replace(
         config,
         preset="quick",
-        steps=80_000,
+        steps=60_000,
         networks=small,
         sac=SAC(batch=128, critic_rate=1e-3, alpha_rate=3e-4, rate_end=0.0, updates=2),
         snapshot_every=10_000,
@@ -91,10 +90,8 @@ def quick(task: str, row: Method) -> Config:
         return replace(config, pretraining=Pretraining(random_steps=1000, until=0))
     return replace(
         config,
-        pretraining=Pretraining(until=20_000),
         queries=replace(config.queries, budget=250, per_session=25, every=2500),
         reward=replace(config.reward, epochs=max(config.reward.epochs, 50)),
-        mds=MotionDistinction(keep=1.0),
         pge=replace(config.pge, every=500),
         bilevel=Bilevel(every=5000),
     )

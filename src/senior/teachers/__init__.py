@@ -11,7 +11,9 @@ from typing import Protocol
 from senior.teachers import scripted
 from senior.types import Answers, Query
 
-TEACHERS = dict.fromkeys(scripted.TEACHERS, "senior.teachers.scripted:Scripted")
+TEACHERS = {
+    **dict.fromkeys(scripted.TEACHERS, "senior.teachers.scripted:Scripted"),
+}
 
 
 class Teacher(Protocol):

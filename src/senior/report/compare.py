@@ -1,0 +1,183 @@
+"""Methods side by side: success against steps and against labels, with intervals, as a table and a figure.
+
+    python -m senior.report.compare runs/methods --out results/methods
+
+reads every finished run at or below the directories, groups them by method, and writes ``table.md``, ``table.csv`` (one
+row per run) and ``curves.png``. An area under a curve is the mean success over it, in [0, 1]; against labels it ends at
+the budget. Intervals are of the mean over seeds, 95 %, by the bootstrap (percentiles, 10,000 resamples, seed 0).
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from scipy import stats
+
+matplotlib.use("Agg")
+
+from matplotlib.figure import Figure
+
+from senior.report.curves import read_table
+from senior.types import BadInput
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is compared of one finished run."""
+
+    path: Path
+    method: str
+    task: str
+    seed: int
+    budget: int  # 0 for a method that asks nothing
+    steps: np.ndarray
+    labels: np.ndarray
+    success: np.ndarray
+
+    @property
+    def area_by_steps(self) -> float:
+        """Mean success over the steps from the first evaluation to the last."""
+        return _mean_over(self.steps, self.success)
+
+    @property
+    def area_by_labels(self) -> float:
+        """Mean success over the labels from none to the budget; NaN if none are asked.
+
+        With each number of labels counts the success at the first evaluation that had so many.
+        """
+        if not self.budget:
+            return float("nan")
+        labels, first = np.unique(self.labels, return_index=True)
+        return _mean_over(labels, self.success[first])
+
+
+def _mean_over(x: np.ndarray, y: np.ndarray) -> float:
+    return float(np.trapezoid(y, x) / (x[-1] - x[0])) if x[-1] > x[0] else float(y[-1])
+
+
+def read(path: Path) -> Run | None:
+    """A run directory as a `Run`; None if it is not finished or tells no success."""
+    config = json.loads((path / "config.json").read_text())["config"]
+    table = {name: np.array(column) for name, column in read_table(path / "eval.csv").items()}
+    if not table or table["step"][-1] != config["steps"] or np.isnan(table["success_rate"]).any():
+        return None
+    asks = config["method"]["select"] != "none"
+    return Run(
+        path,
+        config["method"]["name"],
+        config["env"] or config["task"],
+        config["seed"],
+        config["queries"]["budget"] if asks else 0,
+        table["step"],
+        table["labels"],
+        table["success_rate"],
+    )
+
+
+def interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Mean over seeds, and the 95 % bootstrap interval of it (the mean thrice if all values are equal or one)."""
+    mean = float(np.mean(values))
+    if len(set(values)) < 2:
+        return mean, mean, mean
+    found = stats.bootstrap((np.asarray(values),), np.mean, n_resamples=10_000, method="percentile", rng=0)
+    return mean, float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+def compare(places: Sequence[Path], out: Path) -> str:
+    """Write table and figure of all finished runs below ``places`` into ``out``; returns the table.
+
+    Raises `BadInput` if there are none, or if they are of several tasks.
+    """
+    found = [read(file.parent) for place in places for file in sorted(place.glob("**/config.json"))]
+    runs = [run for run in found if run is not None]
+    if not runs:
+        raise BadInput(f"There is no finished run with a success rate in {', '.join(map(str, places))}.")
+    tasks = sorted({run.task for run in runs})
+    if len(tasks) > 1:
+        raise BadInput(f"These runs are of several tasks ({', '.join(tasks)}); compare those of one.")
+    groups: dict[str, list[Run]] = defaultdict(list)
+    for run in sorted(runs, key=lambda run: run.seed):
+        groups[run.method].append(run)
+    out.mkdir(parents=True, exist_ok=True)
+    _write_rows(runs, out / "table.csv")
+    text = _table(groups)
+    (out / "table.md").write_text(text)
+    _draw(groups, tasks[0], out / "curves.png")
+    return text
+
+
+def _write_rows(runs: Sequence[Run], path: Path) -> None:
+    with open(path, "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("method", "seed", "last_success", "area_by_steps", "area_by_labels"))
+        for run in sorted(runs, key=lambda run: (run.method, run.seed)):
+            areas = (f"{area:.4f}" for area in (run.area_by_steps, run.area_by_labels))
+            writer.writerow((run.method, run.seed, f"{run.success[-1]:.2f}", *areas))
+
+
+def _table(groups: dict[str, list[Run]]) -> str:
+    lines = ["| method | seeds | last success | area by steps | area by labels |", "|---|---|---|---|---|"]
+
+    def cell(values: list[float]) -> str:
+        if np.isnan(values).any():
+            return "-"
+        return "{:.2f} [{:.2f}, {:.2f}]".format(*interval(values))
+
+    for method, runs in sorted(groups.items(), key=lambda group: -interval([r.area_by_steps for r in group[1]])[0]):
+        cells = [
+            cell([float(run.success[-1]) for run in runs]),
+            cell([run.area_by_steps for run in runs]),
+            cell([run.area_by_labels for run in runs]),
+        ]
+        lines.append(f"| `{method}` | {', '.join(str(run.seed) for run in runs)} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _draw(groups: dict[str, list[Run]], task: str, path: Path) -> None:
+    """Mean success with its interval, against steps and, for methods that ask, against labels."""
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    by_steps, by_labels = figure.subplots(1, 2, sharey=True)
+    for number, (method, runs) in enumerate(sorted(groups.items())):
+        color = f"C{number}"
+        shared = [list(run.steps) for run in runs]
+        if any(steps != shared[0] for steps in shared):
+            raise BadInput(f"The runs of {method} were not evaluated at the same steps.")
+        points = np.array([interval(list(column)) for column in np.array([run.success for run in runs]).T])
+        name = f"{method} ({len(runs)})"
+        by_steps.plot(shared[0], points[:, 0], color=color, label=name)
+        by_steps.fill_between(shared[0], points[:, 1], points[:, 2], color=color, alpha=0.12)
+        if not runs[0].budget:
+            continue
+        labels, first = np.unique(runs[0].labels, return_index=True)
+        by_labels.plot(labels, points[first, 0], color=color, marker=".")
+        by_labels.fill_between(labels, points[first, 1], points[first, 2], color=color, alpha=0.12)
+    by_steps.set(xlabel="environment steps", ylabel="success rate", ylim=(-0.03, 1.03), title=f"{task}: mean and 95 %")
+    by_labels.set(xlabel="labels", title="at the first evaluation with so many labels")
+    for axis in (by_steps, by_labels):
+        axis.grid(alpha=0.3)
+    figure.legend(loc="outside right upper")
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """The command line above."""
+    parser = argparse.ArgumentParser(description="Methods side by side: a table and a figure.")
+    parser.add_argument("runs", nargs="+", type=Path, help="run directories, or directories that hold some")
+    parser.add_argument("--out", type=Path, required=True, help="directory for table.md, table.csv and curves.png")
+    options = parser.parse_args()
+    try:
+        print(compare(options.runs, options.out), end="")
+    except BadInput as error:
+        parser.exit(2, f"{error}\n")
+
+
+if __name__ == "__main__":
+    main()
