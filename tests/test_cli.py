@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ import pytest
 
 from senior import envs, program
 from senior.cli import BAD_INPUT, COMMANDS, DONE, FAILED, main
-from senior.config import Config, to_json
+from senior.config import Answering, Config, to_json
 from senior.methods import METHODS
-from senior.presets import preset, quick_changes
+from senior.presets import preset, quick_changes, release
 from senior.types import BadInput
 
 HERE = "tests.test_cli"
@@ -125,9 +126,19 @@ NUMBERS = {
     "--pretraining.until 1000": "Pre-training must last beyond its 1000 random steps",
     "--pge.beta nan": "--pge.beta must be 0 or more, not nan",
     "--pge.beta -0.1": "--pge.beta must be 0 or more",
-    "--pge.decay nan": "--pge.decay must lie between 0 and 1",
+    "--pge.decay nan": "--pge.decay must be at least 0 and below 1, not nan",
     "--bilevel.weight inf": "--bilevel.weight must be 0 or more, not inf",
     "--reward.stop-accuracy nan": "--reward.stop-accuracy must lie between 0 and 1",
+    "--rune.decay 1": "--rune.decay must be at least 0 and below 1, not 1.0",
+    "--rune.beta -1": "--rune.beta must be 0 or more",
+    "--qpa.episodes 1": "--qpa.episodes must be at least 2",
+    "--qpa.share 1.5": "--qpa.share must lie between 0 and 1",
+    "--rationality 0": "--rationality must be a positive number, or -1",
+    "--mistake 1.5": "--mistake must lie between 0 and 1",
+    "--foresight nan": "--foresight must lie between 0 and 1",
+    "--skip -0.1": "--skip must be 0 or more",
+    "--reward.snippets -1": "--reward.snippets must be 0 or more",
+    "--reward.snippets 5": "Windows of 35 to 45 steps do not fit into segments of 10",
     "--replay-capacity 0": "--replay-capacity must be at least 1",
     "--replay-capacity 10000": "cannot hold pre-training's 10000 steps",
     "--precision bfloat16": "--precision bfloat16 is not offered yet",
@@ -147,6 +158,17 @@ COMBINATIONS = {
     "--method sac --pretraining.until 100": "--pretraining.until must be 0",
     "--mix uniform": "--explore preference_guided needs --mix curiosity",
     "--explore none": "--mix curiosity needs --explore preference_guided",
+    "--method qpa --select disagreement": "One member cannot disagree with itself, so --select disagreement needs",
+    "--method qpa --select kcenter_disagreement": "so --select kcenter_disagreement needs --reward.members 2",
+    "--method rune --reward.members 1": "One member cannot disagree with itself",
+    "--method qpa --explore disagreement": "so --explore disagreement needs --reward.members 2 or more",
+    "--method p-senior --compat release": "--compat release is about m-senior",
+    "--compat release --beta-clock refresh": "With pge.clock refresh this is not what the public code does",
+    "--compat release --replay-capacity 50000": "--pge.rest older needs a replay that holds the whole run",
+    "--bilevel.batch update": "takes the batch of the step's update, which cannot be known",
+    "--preset qpa_original --method pebble": "it has no numbers for pebble",
+    "--teacher mistkae --mistake 0.2": "'mistkae'; did you mean mistake",
+    f"--teacher {HERE}:Context --mistake 0.2": "--mistake is a number of scripted teachers, and",
     "--position 0:2": "belong to --env; the task point has its own",
     "--length-scale 2": "belong to --env; the task point has its own",
     "--select no_such_module:Rule": "'no_such_module:Rule' cannot be imported",
@@ -375,6 +397,19 @@ def test_options_reach_the_configuration(monkeypatch: pytest.MonkeyPatch):
     assert (config.env, config.position, config.length_scale, config.horizon) == ("Pendulum-v1", "0:2", 3.0, 100)
     assert (config.evaluation.every, config.evaluation.episodes) == (123, start.evaluation.episodes)
     assert config.reward.epochs == start.reward.epochs
+
+    config, *_ = trained_with("--teacher mistake --mistake 0.2 --equal 0.1 --budget 500", monkeypatch)
+    assert (config.teacher, config.answering) == ("mistake", Answering(mistake=0.2, equal=0.1))
+    assert (config.queries.budget, config.queries.per_session) == (500, 10)
+    config, *_ = trained_with("--budget 500 --per-session 5", monkeypatch)
+    assert (config.queries.budget, config.queries.per_session) == (500, 5)
+    start = preset("paper", "door-lock", "m-senior")
+    assert trained_with("--compat release", monkeypatch)[0] == release(start)
+    config, *_ = trained_with("--select disagreement", monkeypatch)
+    assert config.method == replace(start.method, select="disagreement")
+    config, *_ = trained_with("--explore none --mix uniform --mds.scores mirrored --pge.relabel False", monkeypatch)
+    assert config.method == replace(start.method, explore="none", mix="uniform")
+    assert (config.mds.scores, config.pge.relabel) == ("mirrored", False)
 
 
 def test_a_run_that_broke_is_told_and_ends_with_code_1(capsys: pytest.CaptureFixture[str], monkeypatch):

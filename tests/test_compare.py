@@ -78,3 +78,10 @@ def test_nothing_to_compare_and_several_tasks_are_told(tmp_path: Path):
     run_of(tmp_path, "pebble", 1, [0, 0, 0, 1], task="door-open")
     with pytest.raises(BadInput, match="door-close, door-open"):
         compare([tmp_path], tmp_path / "out")
+
+
+def test_runs_that_are_not_alike_make_no_row(tmp_path: Path):
+    run_of(tmp_path, "pebble", 0, [0, 0, 0, 1])
+    run_of(tmp_path, "pebble", 1, [0, 0, 0, 1], teacher="mistake")
+    with pytest.raises(BadInput, match=r"pebble-0 and .*pebble-1 differ in teacher"):
+        compare([tmp_path], tmp_path / "out")

@@ -286,16 +286,16 @@ def test_a_share_of_every_batch_comes_from_the_curiosity_buffer(batch: int, shar
 def test_without_a_preferred_position_the_batch_is_the_replays_alone():
     drawn = jax.jit(learner_of()._draw)(begun(preferred=0), jax.random.key(0), jnp.int32(0))
     assert np.array_equal(drawn.source, np.full(128, Source.REPLAY))
-    _, info = learn()(begun(preferred=0), jnp.int32(51))
+    _, info = learn()(begun(preferred=0), jnp.int32(51), jnp.int32(0))
     assert float(info["bonus_mean"]) == 0
 
 
 def test_the_bonus_is_paid_from_its_first_use_on_and_enters_the_critics_reward():
     """A silent zero is what happened in the public release."""
     run = begun()
-    _, info = learn()(run, jnp.int32(51))
+    _, info = learn()(run, jnp.int32(51), jnp.int32(0))
     assert float(info["bonus_mean"]) > 1e-3
-    _, unpaid = learn()(run._replace(bonus=run.bonus._replace(beta=jnp.zeros(()))), jnp.int32(51))
+    _, unpaid = learn()(run._replace(bonus=run.bonus._replace(beta=jnp.zeros(()))), jnp.int32(51), jnp.int32(0))
     np.testing.assert_allclose(info["batch_reward"] - unpaid["batch_reward"], info["bonus_mean"], rtol=1e-3)
     assert float(info["critic_loss"]) != float(unpaid["critic_loss"])
 
@@ -326,7 +326,7 @@ def assert_scored(run: learner.Run) -> None:
 
 def test_the_curiosity_buffer_is_relabelled_with_the_replay_and_no_bonus_is_ever_stored():
     tutor, rng = learner_of(), np.random.default_rng(5)
-    before, _ = learn()(begun(), jnp.int32(51))
+    before, _ = learn()(begun(), jnp.int32(51), jnp.int32(0))
     assert_scored(before)
     labelled = Labelled(
         rng.normal(size=(4, 2, 5, 4)).astype(np.float32),  # pyright: ignore[reportArgumentType]

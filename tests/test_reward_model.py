@@ -13,7 +13,7 @@ import pytest
 
 from senior.agent.networks import MLP, apply_mlp, fan_in_uniform
 from senior.reward import model
-from senior.reward.model import FitNumbers, Labelled, RewardModel
+from senior.reward.model import FitNumbers, Labelled, RewardModel, Snippets
 from senior.types import Preferred
 from tests.numeric import Arrays, numeric_gradient
 
@@ -162,6 +162,32 @@ def test_a_step_follows_the_gradient_of_bradley_terry_on_summed_rewards(labels: 
         clear = np.abs(g) > 1e-3
         np.testing.assert_allclose((new - old)[clear], -RATE * np.sign(g[clear]), rtol=1e-2)
     assert_same(before.outer_adam, after.outer_adam)
+
+
+def test_with_windows_the_fit_follows_their_mean_gradient_and_accuracy():
+    """Windows of one step each, and so many that nearly all starts of both segments meet: the gradient is the mean over
+    all pairs of single steps."""
+    before, labelled = model_of(4, members=1), labelled_of([FIRST, SECOND], capacity=2)
+    single = Snippets(copies=3000, shortest=1, longest=1)
+    after, info = jax.jit(lambda m, l, k: model.fit(m, l, k, BATCH, ONE_EPOCH, single))(
+        before, labelled, jax.random.key(0)
+    )
+    members = flat(before.members)
+
+    def by_hand(members: Arrays) -> tuple[float, float]:
+        losses, right = [], []
+        reward = reward_by_hand(members, 0, np.asarray(labelled.observation), np.asarray(labelled.action))  # [2, 2, H]
+        for pair, label in enumerate([FIRST, SECOND]):
+            gap = reward[pair, 0][:, None] - reward[pair, 1][None]  # of every step of the first and of the second
+            losses.append(np.log1p(np.exp(-gap if label == FIRST else gap)).mean())
+            right.append(((gap < 0) == (label == SECOND)).mean())
+        return float(np.mean(losses)), float(np.mean(right))
+
+    gradient = numeric_gradient(lambda at: by_hand(at)[0], members)
+    scale = max(np.abs(g).max() for g in gradient)
+    for moment, g in zip(flat(after.adam.mu), gradient, strict=True):
+        np.testing.assert_allclose(moment / 0.1, g, atol=0.05 * scale)
+    np.testing.assert_allclose(info["fit_accuracy"], by_hand(members)[1], atol=0.05)
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9])

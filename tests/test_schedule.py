@@ -9,6 +9,7 @@ from senior.config import Bilevel, Config, differences
 from senior.methods import METHODS
 from senior.presets import PAPER, preset, release, with_budget
 from senior.schedule import Counts, due, plan
+from senior.types import BadInput
 from tests.small import small
 
 
@@ -57,46 +58,61 @@ def test_a_plan_is_what_comes_of_asking_at_every_step(method: str):
         assert plan(config) == every_step(config)
 
 
+TABLE = {
+    # task: budget, pairs per session, sessions, last session, outer steps, refresh every, episodes of QPA
+    "door-lock": (250, 5, 50, 255_000, 24, 1000, 30),
+    "window-close": (250, 5, 50, 255_000, 24, 500, 30),
+    "handle-press": (250, 10, 25, 130_000, 11, 1000, 30),
+    "window-open": (250, 10, 25, 130_000, 11, 500, 30),
+    "door-open": (1000, 10, 100, 505_000, 49, 1000, 60),
+    "door-unlock": (1000, 20, 50, 255_000, 24, 500, 30),
+    "door-close": (250, 5, 50, 255_000, 24, 1000, 30),  # this and the following are ours
+    "box-close": (1000, 10, 100, 505_000, 49, 1000, 30),
+    "point": (250, 5, 50, 255_000, 24, 1000, 30),
+}
+
+
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("task", PAPER)
-def test_sessions_queries_outer_steps_and_refreshes_of_every_method_and_task(method: str, task: str):
-    """By arithmetic from the tables: nothing of the schedule's own is used."""
-    row, numbers = METHODS[method], PAPER[task]
-    config = preset("paper", task, method)
+@pytest.mark.parametrize("name", ["paper", "qpa_original"])
+@pytest.mark.parametrize("task", TABLE)
+def test_sessions_queries_outer_steps_and_refreshes_of_a_million_steps(task: str, name: str, method: str):
+    if name == "qpa_original" and method != "qpa":
+        with pytest.raises(BadInput, match=f"no numbers for {method}"):
+            preset(name, task, method)
+        return
+    row, config = METHODS[method], preset(name, task, method)
     counts = plan(config)
     if method == "sac":
         assert counts == Counts(0, 0, 0, 0, 0, 0, 1_000_000 - 5001)
         return
-    sessions = -(-numbers.budget // numbers.per_session)
-    last = 10_000 + 5000 * (sessions - 1)
-    outer = len([step for step in range(20_000, 1_000_000, 10_000) if step < last])
-    pge = row.explore == "preference_guided"
-    assert counts == Counts(
-        sessions,
-        numbers.budget,
-        last,
-        outer if row.outer == "bilevel" else 0,
-        990_000 // numbers.refresh_every if pge else 0,
-        8999,
-        990_000 - 1 + 100,
-    )
-    assert config.window == ((60 if task == "door-open" else 30) if method == "qpa" else 100)
-    assert config.reward.members == (1 if method == "qpa" else 3)
-    assert config.reward.epochs == (200 if method == "qpa" else 10)
-    assert bool(config.reward.snippets) == (method == "qpa")
-    beta, decay = {"disagreement": (config.rune.beta, config.rune.decay)}.get(
-        row.explore, (config.pge.beta, config.pge.decay)
-    )
-    assert (beta, decay) == ((0.05, 1e-5) if row.explore == "disagreement" else (0.1, 0.01))
+    budget, per_session, sessions, last, outer, refresh, recent = TABLE[task]
+    bilevel, pge = row.outer == "bilevel", row.explore == "preference_guided"
+    assert config.queries.per_session == per_session
+    assert counts == Counts(sessions, budget, last, outer * bilevel, 990_000 // refresh * pge, 8999, 990_000 - 1 + 100)
+    assert config.window == (recent if method == "qpa" else 100)
+    original = name == "qpa_original"
+    assert (config.reward.members, config.reward.epochs) == ((1, 200) if method == "qpa" else (3, 10))
+    assert config.reward.snippets == (20 if method == "qpa" and not original else 0)
+    weight = (config.rune.beta, config.rune.decay) if row.explore == "disagreement" else (0.05, 1e-5)
+    assert weight == (0.05, 1e-5)
+    assert (config.pge.beta, config.pge.decay, config.pge.share, config.mds.keep) == (0.1, 0.01, 0.3, 0.3)
+    networks, sac = config.networks, config.sac
+    assert (networks.layers, networks.width, sac.batch) == ((2, 1024, 1024) if original else (3, 256, 512))
+    rates = (sac.actor_rate, sac.critic_rate, sac.alpha_rate)
+    assert rates == ((1e-4, 1e-4, 1e-4) if original else (3e-4, 3e-4, 1e-4))
+    assert config.evaluation.episodes == (100 if original else 10)
+    assert set(TABLE) == set(PAPER)
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("task", PAPER)
-def test_the_quick_preset_spends_its_budget_while_it_learns(method: str, task: str):
-    config = preset("quick", task, method)
-    counts = plan(config)
-    assert counts.queried == (0 if method == "sac" else 250)
-    assert counts.last_session <= 0.6 * config.steps
+@pytest.mark.parametrize("task", TABLE)
+def test_the_quick_presets_run_is_the_same_on_every_task(task: str, method: str):
+    row, counts = METHODS[method], plan(preset("quick", task, method))
+    if method == "sac":
+        assert counts == Counts(0, 0, 0, 0, 0, 0, 2 * (60_000 - 1001))
+        return
+    bilevel, pge = row.outer == "bilevel", row.explore == "preference_guided"
+    assert counts == Counts(10, 250, 32_500, 4 * bilevel, 100 * pge, 8999, 2 * (50_000 - 1) + 100)
 
 
 @pytest.mark.parametrize(

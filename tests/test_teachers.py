@@ -9,7 +9,8 @@ import pytest
 
 from senior import parts
 from senior.config import Answering, Config
-from senior.teachers.scripted import TEACHERS, Numbers, Scripted, judge
+from senior.learner import Purpose
+from senior.teachers.scripted import RANDOM, TEACHERS, Numbers, Scripted, judge
 from senior.types import BadInput, Pairs, Preferred, Query
 
 MANY = 100_000
@@ -90,7 +91,7 @@ def assert_share(hits: np.ndarray, probability: np.ndarray | float) -> None:
 
 def judged(reward: np.ndarray, numbers: Numbers, average: float = 2.0) -> np.ndarray:
     """Answers as an array, NaN where a pair was skipped."""
-    return np.array(judge(reward, numbers, average, np.random.default_rng(11)), float)
+    return np.array(judge(reward, numbers, average, np.random.default_rng(11).random((len(reward), 2))), float)
 
 
 def truth(reward: np.ndarray, foresight: float = 1.0) -> np.ndarray:
@@ -179,15 +180,18 @@ def test_two_teachers_share_no_answers():
 def test_what_is_random_depends_on_the_run_and_on_the_pairs_number_alone():
     reward = random_pairs(5)[:500]
 
-    def said(seed: int, first: int) -> list[int | None]:
+    def said(seed: int, first: int, together: int) -> list[int | None]:
         teacher = Scripted(TEACHERS["noisy"], seed)
-        teacher.ask([99], query_of(reward[:1]))  # what was asked before does not matter
-        teacher.ask(list(range(first, first + 500)), query_of(reward))
-        return teacher.collect().labels[1:]
+        for start in range(0, 500, together):
+            teacher.ask(
+                list(range(first + start, first + start + together)), query_of(reward[start : start + together])
+            )
+        return teacher.collect().labels
 
-    assert said(0, 1) == said(0, 1)
-    assert said(0, 1) != said(1, 1)
-    assert said(0, 1) != said(0, 501)
+    assert said(0, 1, 500) == said(0, 1, 20)
+    assert said(0, 1, 500) != said(1, 1, 500)
+    assert said(0, 1, 500) != said(0, 501, 500)
+    assert RANDOM == Purpose.TEACHER
 
 
 # From a configuration.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from senior.config import Config
     from senior.loop import Watcher
     from senior.methods import METHODS, Method
-    from senior.presets import preset
+    from senior.presets import preset, release, with_budget
     from senior.program import Judgement, Quiet, Result, evaluate_run, resume, train
     from senior.schedule import plan
     from senior.select import Context, Selection
@@ -40,8 +40,10 @@ _HOME = {
     "evaluate_run": "program",
     "plan": "schedule",
     "preset": "presets",
+    "release": "presets",
     "resume": "program",
     "train": "program",
+    "with_budget": "presets",
 }
 
 __all__ = [
@@ -62,8 +64,10 @@ __all__ = [
     "evaluate_run",
     "plan",
     "preset",
+    "release",
     "resume",
     "train",
+    "with_budget",
 ]
 
 

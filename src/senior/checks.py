@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from senior.config import Config
+from senior.config import Config, differences
+from senior.presets import release
 from senior.types import BadInput
 
 
@@ -74,7 +75,6 @@ def check(config: Config) -> Config:
         ("--qpa.share", config.qpa.share),
         *((f"--{name}", getattr(config.answering, name) or 0.0) for name in ("mistake", "foresight")),
         ("--mds.keep", config.mds.keep),
-        ("--pge.decay", config.pge.decay),
         ("--sac.tau", config.sac.tau),
         ("--sac.discount", config.sac.discount),
         ("--sac.rate-end", config.sac.rate_end),
@@ -89,7 +89,8 @@ def check(config: Config) -> Config:
         math.isfinite(config.sac.target_entropy),
         f"--sac.target-entropy must be a number, not {config.sac.target_entropy}.",
     )
-    _require(0 <= config.rune.decay < 1, f"--rune.decay must be at least 0 and below 1, not {config.rune.decay}.")
+    for name, decay in (("--pge.decay", config.pge.decay), ("--rune.decay", config.rune.decay)):
+        _require(0 <= decay < 1, f"{name} must be at least 0 and below 1, not {decay}.")
     rationality = config.answering.rationality
     _require(
         rationality is None or rationality == -1 or 0 < rationality < float("inf"),
@@ -130,10 +131,31 @@ def check(config: Config) -> Config:
             f"Windows of {shortest} to {longest} steps do not fit into segments of {queries.segment}; set "
             "--reward.snippet-min and --reward.snippet-max.",
         )
+    for cell, value in (("--select", row.select), ("--explore", row.explore)):
+        _require(
+            config.reward.members > 1 or value not in ("disagreement", "kcenter_disagreement"),
+            f"One member cannot disagree with itself, so {cell} {value} needs --reward.members 2 or more.",
+        )
+    if row.outer == "bilevel" and config.bilevel.batch == "update":
+        _require(
+            row.mix != "recent" and (row.mix != "curiosity" or not config.pge.refresh_with_outer),
+            "--bilevel.batch update takes the batch of the step's update, which cannot be known with --mix recent, nor "
+            "with --mix curiosity unless --pge.refresh-with-outer False.",
+        )
     if config.compat == "release":
         _require(
             row.select == "motion_distinction" and row.explore == "preference_guided" and row.outer == "bilevel",
             "--compat release is about m-senior: no other method is in its authors' public code.",
+        )
+        for name, _, value in differences(release(config), config):
+            raise BadInput(
+                f"With {name} {value} this is not what the public code does; leave --compat release out and give its "
+                "other options by themselves."
+            )
+    if row.mix == "curiosity" and config.pge.rest == "older":
+        _require(
+            config.capacity >= config.steps,
+            "--pge.rest older needs a replay that holds the whole run; leave --replay-capacity out.",
         )
     if row.explore == "preference_guided":
         every = config.pge.every

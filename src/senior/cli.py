@@ -65,7 +65,7 @@ class BenchOptions:
     method: str = "all"
     """A method of `senior methods`, or all."""
     preset: str = "paper"
-    """paper or quick."""
+    """paper, quick or qpa_original."""
     task: str = "door-lock"
     """A task of `senior tasks`."""
     steps: int = 300

@@ -25,7 +25,7 @@ def accuracy_at_chance(right: Sequence[int], asked: Sequence[int]) -> str | None
 
 
 def bonus_zero(beta: float, intrinsic_mean: float) -> str | None:
-    """Right after a refresh of the bonus."""
+    """Of the last update of an episode."""
     if beta * intrinsic_mean > 1e-6:
         return None
     return (

@@ -21,7 +21,7 @@ from senior.config import Config
 from senior.explore import Bonus, Now, preference_guided, state_entropy
 from senior.replay import Fact, Replay
 from senior.reward import bilevel, model
-from senior.types import Batch, EnvSpec
+from senior.types import Batch, EnvSpec, Source
 
 
 class Purpose(IntEnum):
@@ -281,7 +281,11 @@ class Learner:
             move = nth % self.config.sac.target_every == 0
             agent, info = sac.update(agent, batch, reward, key_update, numbers, move, self.critic)
             told = self.bonus.report(run.bonus, batch, now)
-            return agent, {**info, **told, "bonus_mean": paid.mean(), "batch_reward": reward.mean()}
+            shares = {
+                f"{source.name.lower()}_share": jnp.mean(batch.source == source)
+                for source in (Source.CURIOSITY, Source.RECENT)
+            }
+            return agent, {**info, **told, **shares, "bonus_mean": paid.mean(), "batch_reward": reward.mean()}
 
         if len(count) == 1:
             agent, info = one(run.agent, count[0])

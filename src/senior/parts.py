@@ -62,6 +62,7 @@ def answering(config: Config) -> Answering:
     asked = {name: value for name, value in asdict(config.answering).items() if value is not None}
     own = scripted.TEACHERS.get(config.teacher)
     if own is None:
+        load(config.teacher, TEACHERS, "teacher")
         if asked:
             raise BadInput(f"--{next(iter(asked))} is a number of scripted teachers, and {config.teacher} is none.")
         return config.answering

@@ -139,7 +139,7 @@ def release(config: Config) -> Config:
 
 
 def with_budget(config: Config, budget: int) -> Config:
-    """Another budget, asked in as many sessions as the preset's: pairs per session grow with it, and are at least 1.
+    """Another budget, asked in about as many sessions as the preset's: pairs per session grow with it, at least 1.
 
     The paper does not tell how it spent its budgets of 150 to 1,000; with five pairs per session a million steps hold
     990.

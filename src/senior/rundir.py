@@ -52,6 +52,8 @@ TRAIN = (
     "beta",
     "intrinsic_mean",
     "bonus_mean",
+    "curiosity_share",
+    "recent_share",
     "batch_reward",
     "critic_loss",
     "actor_loss",

@@ -5,6 +5,7 @@ A bonus is a new file here and a line in `BONUSES`; a third party's is named ``m
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from senior.types import Batch
@@ -19,6 +20,13 @@ BONUSES = {
     "disagreement": "senior.explore.disagreement:Disagreement",
     "preference_guided": "senior.explore.preference_guided:PreferenceGuided",
 }
+
+
+def decayed(beta: float, decay: float, ticks: Array) -> Array:
+    """beta (1 - decay)^ticks. In float32 1 - decay would lose decay's digits, and a million ticks make that 3 %."""
+    import jax.numpy as jnp
+
+    return beta * jnp.exp(ticks * math.log1p(-decay))
 
 
 class Now(NamedTuple):

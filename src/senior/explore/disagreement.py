@@ -7,13 +7,11 @@ steps. It is added in the critics' target only: the learned reward itself stays 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from senior.explore import Now
+from senior.explore import Now, decayed
 from senior.replay import Replay
 from senior.types import Batch, EnvSpec
 
@@ -47,5 +45,4 @@ class Disagreement:
         return {"beta": self._weight(now), "intrinsic_mean": batch.spread.mean()}
 
     def _weight(self, now: Now) -> Array:
-        # 1 - rho itself would lose rho's digits in float32, and a million steps make that 3 %
-        return self.beta * jnp.exp(now.step * math.log1p(-self.decay))
+        return decayed(self.beta, self.decay, now.step)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from senior import replay as replay_
 from senior.density import log_density
-from senior.explore import Now
+from senior.explore import Now, decayed
 from senior.replay import Replay
 from senior.types import Batch, EnvSpec, Source
 
@@ -44,8 +44,8 @@ def draw(state: State, key: PRNGKeyArray, size: int) -> Int[Array, " size"]:
 def older(state: State, replay: Replay, key: PRNGKeyArray, size: int, tries: int = 16) -> Batch:
     """Rows that were in the replay at the last refresh and are not in the curiosity buffer, as the public code draws.
 
-    The first of ``tries`` uniform draws that is not in the buffer; before the first refresh, and in the rare case that
-    all are, the last draw.
+    Of ``tries`` uniform draws the first that is not in the buffer; the last where all are, or before the first refresh.
+    Rows must keep their place: for a replay that holds the whole run.
     """
     bound = jnp.where(state.ready, state.filled, replay.filled)
     drawn = jax.random.randint(key, (tries, size), 0, jnp.maximum(bound, 1))
@@ -120,7 +120,7 @@ class PreferenceGuided:
             curiosity=drawn,
             intrinsic=jnp.where(state.any_preferred, value, 0.0),
             ready=state.any_preferred,
-            beta=self.beta * (1 - self.decay) ** ticks.astype(jnp.float32),
+            beta=decayed(self.beta, self.decay, ticks),
             refreshes=state.refreshes + 1,
             rows=rows,
             filled=replay.filled,

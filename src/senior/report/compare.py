@@ -3,8 +3,9 @@
     python -m senior.report.compare runs/methods --out results/methods
 
 reads every finished run at or below the directories, groups them by method, and writes ``table.md``, ``table.csv`` (one
-row per run) and ``curves.png``. An area under a curve is the mean success over it, in [0, 1]; against labels it ends at
-the budget. Intervals are of the mean over seeds, 95 %, by the bootstrap (percentiles, 10,000 resamples, seed 0).
+row per run) and ``curves.png``. Runs of one method must be alike but for their seeds. An area under a curve is the mean
+success over it, in [0, 1]; against labels it counts asked pairs, skipped ones too, and ends at the budget. Intervals
+are of the mean over seeds, 95 %, by the bootstrap (percentiles, 10,000 resamples, seed 0).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -37,10 +39,14 @@ class Run:
     method: str
     task: str
     seed: int
-    budget: int  # 0 for a method that asks nothing
+    config: dict[str, Any]
     steps: np.ndarray
-    labels: np.ndarray
+    queried: np.ndarray
     success: np.ndarray
+
+    @property
+    def asks(self) -> bool:
+        return self.config["method"]["select"] != "none"
 
     @property
     def area_by_steps(self) -> float:
@@ -49,14 +55,14 @@ class Run:
 
     @property
     def area_by_labels(self) -> float:
-        """Mean success over the labels from none to the budget; NaN if none are asked.
+        """Mean success over the asked pairs from none to the budget; NaN if none are asked.
 
-        With each number of labels counts the success at the first evaluation that had so many.
+        With each number of pairs counts the success at the first evaluation that had so many.
         """
-        if not self.budget:
+        if not self.asks:
             return float("nan")
-        labels, first = np.unique(self.labels, return_index=True)
-        return _mean_over(labels, self.success[first])
+        queried, first = np.unique(self.queried, return_index=True)
+        return _mean_over(queried, self.success[first])
 
 
 def _mean_over(x: np.ndarray, y: np.ndarray) -> float:
@@ -69,15 +75,14 @@ def read(path: Path) -> Run | None:
     table = {name: np.array(column) for name, column in read_table(path / "eval.csv").items()}
     if not table or table["step"][-1] != config["steps"] or np.isnan(table["success_rate"]).any():
         return None
-    asks = config["method"]["select"] != "none"
     return Run(
         path,
         config["method"]["name"],
         config["env"] or config["task"],
-        config["seed"],
-        config["queries"]["budget"] if asks else 0,
+        config.pop("seed"),
+        config,
         table["step"],
-        table["labels"],
+        table["queried"],
         table["success_rate"],
     )
 
@@ -106,6 +111,10 @@ def compare(places: Sequence[Path], out: Path) -> str:
     groups: dict[str, list[Run]] = defaultdict(list)
     for run in sorted(runs, key=lambda run: run.seed):
         groups[run.method].append(run)
+        first = groups[run.method][0]
+        for name in run.config:
+            if run.config[name] != first.config.get(name):
+                raise BadInput(f"{first.path} and {run.path} differ in {name}; only runs that are alike make one row.")
     out.mkdir(parents=True, exist_ok=True)
     _write_rows(runs, out / "table.csv")
     text = _table(groups)
@@ -154,13 +163,13 @@ def _draw(groups: dict[str, list[Run]], task: str, path: Path) -> None:
         name = f"{method} ({len(runs)})"
         by_steps.plot(shared[0], points[:, 0], color=color, label=name)
         by_steps.fill_between(shared[0], points[:, 1], points[:, 2], color=color, alpha=0.12)
-        if not runs[0].budget:
+        if not runs[0].asks:
             continue
-        labels, first = np.unique(runs[0].labels, return_index=True)
+        labels, first = np.unique(runs[0].queried, return_index=True)
         by_labels.plot(labels, points[first, 0], color=color, marker=".")
         by_labels.fill_between(labels, points[first, 1], points[first, 2], color=color, alpha=0.12)
     by_steps.set(xlabel="environment steps", ylabel="success rate", ylim=(-0.03, 1.03), title=f"{task}: mean and 95 %")
-    by_labels.set(xlabel="labels", title="at the first evaluation with so many labels")
+    by_labels.set(xlabel="pairs asked", title="at the first evaluation with so many pairs asked")
     for axis in (by_steps, by_labels):
         axis.grid(alpha=0.3)
     figure.legend(loc="outside right upper")

@@ -57,8 +57,8 @@ class Scripted:
         """Answer pairs; ``query.reward_per_step`` tells what the thresholds are shares of."""
         reward = query.pairs.reward.astype(np.float64)  # [P, 2, H]
         average = query.reward_per_step * reward.shape[-1]
-        rng = np.random.default_rng([self.seed, RANDOM, ids[0]]) if ids else np.random.default_rng(0)
-        labels = judge(reward, self.numbers, average, rng)
+        chance = np.array([np.random.default_rng([self.seed, RANDOM, number]).random(2) for number in ids])
+        labels = judge(reward, self.numbers, average, chance)
         self._answers = Answers(self._answers.ids + ids, self._answers.labels + labels)
 
     def collect(self) -> Answers:
@@ -67,21 +67,21 @@ class Scripted:
         return answers
 
 
-def judge(reward: np.ndarray, numbers: Numbers, average: float, rng: np.random.Generator) -> list[int | None]:
+def judge(reward: np.ndarray, numbers: Numbers, average: float, chance: np.ndarray) -> list[int | None]:
     """Answers to pairs of segments with those true rewards ``[P, 2, H]``; None: skipped.
 
-    average: what a segment earned in the latest episodes. A tie goes to the first.
+    average: what a segment earned in the latest episodes. chance: uniform numbers in [0, 1) ``[P, 2]``, of each
+    pair one for the comparison and one for the mistake. A tie goes to the first.
     """
-    pairs, _, steps = reward.shape
+    steps = reward.shape[-1]
     total = reward.sum(axis=-1)
     weighed = (reward * numbers.foresight ** np.arange(steps - 1, -1, -1.0)).sum(axis=-1)
     advantage = weighed[:, 1] - weighed[:, 0]  # of the second
-    chance = rng.random((2, pairs))
     if numbers.rationality <= 0:
         second = advantage > 0
     else:
-        second = chance[0] < 1 / (1 + np.exp(np.clip(-numbers.rationality * advantage, -700, 700)))
-    second = second ^ (chance[1] < numbers.mistake)
+        second = chance[:, 0] < 1 / (1 + np.exp(np.clip(-numbers.rationality * advantage, -700, 700)))
+    second = second ^ (chance[:, 1] < numbers.mistake)
     labels = np.where(second, Preferred.SECOND, Preferred.FIRST)
     labels[np.abs(total[:, 0] - total[:, 1]) < numbers.equal * average] = Preferred.EQUAL
     least = numbers.skip * average
