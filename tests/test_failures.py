@@ -141,6 +141,24 @@ def test_only_the_run_that_broke_stops_and_it_can_go_on(
     assert_same_run(mended.path, whole[1].path, interrupted=True)
 
 
+def test_under_vmap_too_only_the_run_that_broke_stops_with_its_step_undone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The update of step 649 is under way when the environment breaks; the checkpoint is as if the run ended there."""
+    break_it(monkeypatch, Fault("raise", 650))
+    said = Said()
+    good, broken = train(config(), tmp_path / "broken", seeds=2, watcher=said, lift="vmap")
+    assert_stopped(broken, 649, "RuntimeError: motor burnt", said)
+    assert good.finished and good.step == 700
+    break_it(monkeypatch, None)
+    _, stopped = train(replace(config(), steps=649), tmp_path / "stopped", seeds=2, watcher=said, lift="vmap")
+    one, other = (unpack(run.path / "checkpoints" / "step-0000000649.npz") for run in (broken, stopped))
+    compared = [name for name in one if name.startswith("run.agent")]
+    assert len(compared) > 20
+    for name in compared:
+        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
 def test_a_break_that_stays_stops_the_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     break_it(monkeypatch, Fault("nan", 30, seed=0))
     said = Said()

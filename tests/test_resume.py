@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,16 @@ import pytest
 
 from senior import cli
 from senior.checkpoint import steps
-from senior.config import load
+from senior.config import Answering, Config, load
 from senior.envs.point import Point
+from senior.presets import release
 from senior.program import Quiet, load_policy, resume, train
+from senior.schedule import plan
 from senior.trainee import Trainee
 from senior.types import BadInput
 from tests import victim
 from tests.equal import OPTIONS, assert_same_run, progress_of, short
-from tests.small import preferences_dump, rows
+from tests.small import preferences_dump, rows, small
 
 ROOT = Path(__file__).parents[1]
 
@@ -180,6 +183,31 @@ def test_interrupted_at_awkward_moments(reference: Path, tmp_path: Path):
     (result,) = resume(tmp_path)
     assert result.finished
     assert_same_run(tmp_path / "seed-0", reference / "seed-0", interrupted=True)
+
+
+def noisy_qpa() -> Config:
+    """QPA with a teacher that errs, skips and calls equal."""
+    config = small("qpa")
+    keep = {
+        name: getattr(short(), name) for name in ("steps", "horizon", "replay_capacity", "checkpoint_every", "queries")
+    }
+    answering = Answering(rationality=1.0, mistake=0.2, skip=0.9, equal=0.1)
+    return replace(config, **keep, teacher="noisy", answering=answering, qpa=replace(config.qpa, episodes=4))
+
+
+@pytest.mark.parametrize("name", ["qpa", "release"])
+def test_other_methods_and_a_teacher_of_chance_go_on_alike_too(name: str, tmp_path: Path):
+    config = noisy_qpa() if name == "qpa" else replace(release(short()), replay_capacity=None)
+    (whole,) = train(config, tmp_path / "whole")
+    assert whole.finished
+    train(config, tmp_path / "cut", watcher=Stop(420))
+    for step in (601, 799):
+        resume(tmp_path / "cut", Stop(step))
+    (result,) = resume(tmp_path / "cut")
+    assert result.finished
+    assert_same_run(result.path, whole.path, interrupted=True)
+    if name == "qpa":
+        assert 0 < whole.labels < plan(config).queried
 
 
 def test_a_finished_run_is_left_as_it_is(reference: Path, tmp_path: Path):

@@ -41,7 +41,8 @@ def every_step(config: Config) -> Counts:
         now = due(config, step, queried)
         if now.session:
             sessions, queried, last = sessions + 1, queried + now.session, step
-        outer, refreshes, pretraining = outer + now.outer, refreshes + now.refresh, pretraining + now.pretrain
+        outer, refreshes = outer + now.outer, refreshes + now.refresh
+        pretraining += now.pretrain * config.pretraining.updates
         updates += now.update * config.sac.updates + now.begin * config.sac.reset_updates
     return Counts(sessions, queried, last, outer, refreshes, pretraining, updates)
 

@@ -41,6 +41,7 @@ def check(config: Config) -> Config:
         ("--checkpoint-every", config.checkpoint_every),
         ("--snapshot-every", config.snapshot_every),
         ("--pretraining.neighbours", config.pretraining.neighbours),
+        ("--pretraining.updates", config.pretraining.updates),
         ("--pge.capacity", config.pge.capacity),
         ("--reward.snippet-min", config.reward.snippet_min),
         ("--replay-capacity", 1 if config.replay_capacity is None else config.replay_capacity),

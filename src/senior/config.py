@@ -83,6 +83,8 @@ class Pretraining:
     """Step at which pre-training ends and the first session takes place. 0: no pre-training (plain SAC)."""
     neighbours: int = 5
     """The k of the k-nearest-neighbour state entropy."""
+    updates: int = 1
+    """Updates per environment step."""
 
 
 @dataclass(frozen=True)

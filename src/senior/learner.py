@@ -6,6 +6,7 @@ Every function takes the state of one run first and returns ``(state, result)``;
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -149,12 +150,20 @@ class Learner:
         return self.store(run, fact)
 
     def pretrain(self, run: Run, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
-        """One update whose reward is the state entropy."""
-        key_batch, key_update = jax.random.split(_key(run, Purpose.UPDATE, step))
-        batch = replay_.sample(run.replay, key_batch, self.config.sac.batch)
-        deviation, reward = state_entropy.reward(_some(run.entropy), _some(run.deviation), batch.row)
-        move = step % self.config.sac.target_every == 0
-        agent, info = sac.update(run.agent, batch, reward, key_update, run.numbers.sac, move, self.critic)
+        """The updates of a step whose reward is the state entropy."""
+        key, times = _key(run, Purpose.UPDATE, step), self.config.pretraining.updates
+
+        def one(
+            state: tuple[sac.Agent, state_entropy.Deviation], nth: Array
+        ) -> tuple[tuple[sac.Agent, state_entropy.Deviation], dict[str, Array]]:
+            key_batch, key_update = self._nth(key, nth)
+            batch = replay_.sample(run.replay, key_batch, self.config.sac.batch)
+            deviation, reward = state_entropy.reward(_some(run.entropy), state[1], batch.row)
+            move = nth % self.config.sac.target_every == 0
+            agent, info = sac.update(state[0], batch, reward, key_update, run.numbers.sac, move, self.critic)
+            return (agent, deviation), info
+
+        (agent, deviation), info = _in_turn(one, (run.agent, _some(run.deviation)), step * times + jnp.arange(times))
         return run._replace(agent=agent, deviation=deviation), info
 
     def learn(self, run: Run, step: Int[Array, ""], recent: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
@@ -287,11 +296,7 @@ class Learner:
             }
             return agent, {**info, **told, **shares, "bonus_mean": paid.mean(), "batch_reward": reward.mean()}
 
-        if len(count) == 1:
-            agent, info = one(run.agent, count[0])
-        else:
-            agent, infos = jax.lax.scan(one, run.agent, count)
-            info = jax.tree.map(lambda values: values[-1], infos)
+        agent, info = _in_turn(one, run.agent, count)
         return run._replace(agent=agent), info
 
     def _score(self, run: Run, observation: Array, action: Array) -> tuple[Array, Array]:
@@ -341,6 +346,14 @@ def mean_action(actor: MLP, observation: Float[Array, " o"]) -> Float[Array, " a
 
 def _key(run: Run | Acting, purpose: Purpose, step: Array | int) -> PRNGKeyArray:
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(run.seed), purpose), step)
+
+
+def _in_turn(one: Callable[[Any, Array], tuple[Any, dict[str, Array]]], state: Any, count: Array) -> Any:
+    """What updates make of a state one after the other, and the last one's numbers."""
+    if len(count) == 1:
+        return one(state, count[0])
+    state, infos = jax.lax.scan(one, state, count)
+    return state, jax.tree.map(lambda values: values[-1], infos)
 
 
 def _some(part: Any) -> Any:

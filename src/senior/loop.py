@@ -180,7 +180,7 @@ class Training:
             returns = self.runs.every(learner.store, ("replay", "learned_return"), mask, facts)
         for i in self.active():
             one, plan, trainee = happened[i], plans[i], self.trainees[i]
-            trainee.progress.pretraining_updates += plan.pretrain
+            trainee.progress.pretraining_updates += plan.pretrain * trainee.config.pretraining.updates
             trainee.progress.updates += plan.update * trainee.config.sac.updates
             if one is None:
                 continue

@@ -101,6 +101,6 @@ def plan(config: Config) -> Counts:
         last_session,
         outer,
         refreshes,
-        pretraining_updates=max(0, min(until, last) - random_steps - 1),
+        pretraining_updates=max(0, min(until, last) - random_steps - 1) * config.pretraining.updates,
         updates=max(0, last - until - 1) * config.sac.updates + begun * config.sac.reset_updates,
     )
