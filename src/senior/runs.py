@@ -233,6 +233,7 @@ def _avoid_hang() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} {flag}=false".strip()
 
 
+@lru_cache(maxsize=1)  # mallopt is not meant to be called beside other threads again and again
 def _keep_memory() -> None:
     """Let glibc keep the memory that every update takes and frees, instead of fetching it from the system anew.
 
