@@ -26,7 +26,7 @@ if WORKER and sys.platform == "linux":
 def pytest_configure(config: pytest.Config) -> None:
     # An entry that another worker is still writing, or a killed run left half-written, is compiled again.
     config.addinivalue_line("filterwarnings", "ignore:Error (reading|writing) persistent compilation cache")
-    # The store is for the processes that tests start. In a worker, which compiles hundreds of programs, writing an entry
+    # The store is for the processes that tests start. In a worker, which compiles hundreds of programs, writing to it
     # ended in a segmentation fault once (CONTRIBUTING.md).
     import jax
 
