@@ -27,6 +27,7 @@ def empty(capacity: int = CAPACITY) -> Run:
         model=None,
         replay=replay.init(capacity, 4, 2),
         entropy=None,
+        deviation=None,
         bonus={"ready": jnp.bool_(False)},
         length_scale=jnp.float32(1),
         learned_return=jnp.float32(0),

@@ -168,7 +168,7 @@ COMBINATIONS = {
     "--bilevel.batch update": "takes the batch of the step's update, which cannot be known",
     "--preset qpa_original --method pebble": "it has no numbers for pebble",
     "--teacher mistkae --mistake 0.2": "'mistkae'; did you mean mistake",
-    f"--teacher {HERE}:Context --mistake 0.2": "--mistake is a number of scripted teachers, and",
+    f"--teacher {HERE}:contents --mistake 0.2": "--mistake is a number of scripted teachers, and",
     "--position 0:2": "belong to --env; the task point has its own",
     "--length-scale 2": "belong to --env; the task point has its own",
     "--select no_such_module:Rule": "'no_such_module:Rule' cannot be imported",
