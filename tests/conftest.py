@@ -1,5 +1,6 @@
 """What a test process needs before JAX is imported: the CPU, a core of its own, a store of compiled code."""
 
+import gc
 import os
 import sys
 import time
@@ -26,11 +27,16 @@ if WORKER and sys.platform == "linux":
 def pytest_configure(config: pytest.Config) -> None:
     # An entry that another worker is still writing, or a killed run left half-written, is compiled again.
     config.addinivalue_line("filterwarnings", "ignore:Error (reading|writing) persistent compilation cache")
-    # The store is for the processes that tests start. In a worker, which compiles hundreds of programs, writing to it
-    # ended in a segmentation fault once (CONTRIBUTING.md).
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forget_compiled():
+    """Let go of a module's programs: XLA crashed in workers that held hundreds of them (CONTRIBUTING.md)."""
+    yield
     import jax
 
-    jax.config.update("jax_enable_compilation_cache", False)
+    jax.clear_caches()
+    gc.collect()
 
 
 def pytest_sessionstart() -> None:
