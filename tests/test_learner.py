@@ -21,7 +21,7 @@ from senior.preferences import Preferences
 from senior.program import Quiet, make_learner, train
 from senior.replay import Fact
 from senior.reward.bilevel import FirstSteps
-from senior.reward.model import rewards
+from senior.reward.model import Labelled, rewards
 from senior.runs import Runs
 from senior.schedule import plan
 from senior.teachers.scripted import Scripted
@@ -316,6 +316,31 @@ def test_the_length_scale_is_ten_times_the_spread_of_the_positions_that_are_stor
 
 
 # The pairs of the outer step.
+
+
+def test_a_fit_standardises_by_what_is_stored_and_scores_the_replay_so(lived: Run):
+    config = replace(CONFIG, reward=replace(CONFIG.reward, standardise=True))
+    learner = make_learner(config)
+    new = learner.init(3)
+    assert new.model and new.model.inputs is not None
+    run = lived._replace(model=new.model)
+    rng = np.random.default_rng(0)
+    capacity = CONFIG.queries.budget
+    labelled = Labelled(
+        rng.normal(size=(capacity, 2, SEGMENT, 4)).astype(np.float32),
+        rng.uniform(-1, 1, (capacity, 2, SEGMENT, 2)).astype(np.float32),
+        np.zeros(capacity, np.int32),
+        np.int32(8),
+    )  # pyright: ignore[reportArgumentType]
+    fitted, _ = after(learner.fit, run, labelled, np.int32(UNTIL))
+    stored = np.asarray(lived.replay.facts.observation[:FACTS])
+    np.testing.assert_allclose(fitted.model.inputs.mean, stored.mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(fitted.model.inputs.deviation, stored.std(axis=0), rtol=1e-4)
+    standard = (stored - stored.mean(axis=0)) / stored.std(axis=0)
+    expected = rewards(fitted.model.members, standard, lived.replay.facts.action[:FACTS])
+    np.testing.assert_allclose(fitted.replay.learned_reward[:FACTS], expected.mean(axis=0), atol=1e-5)
+    _, summed = after(learner.summed_rewards, fitted, stored[None, None], lived.replay.facts.action[None, None, :FACTS])
+    np.testing.assert_allclose(summed[:, 0, 0], expected.sum(axis=-1), rtol=1e-3, atol=1e-3)
 
 
 def test_the_latest_labelled_pairs_are_those_of_one_session_and_padded_without_weight(tmp_path: Path):

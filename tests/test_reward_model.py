@@ -120,6 +120,32 @@ def test_the_learned_reward_stays_in_its_range_however_large_the_weights_are():
     assert np.abs(every.mean(axis=0)).max() <= 1
 
 
+def test_standardised_entries_have_mean_0_and_deviation_1_within_ten():
+    """An entry that never moved, one that hardly did, and one that is far away now."""
+    rng = np.random.default_rng(0)
+    seen = rng.normal(size=(500, O)) * [2.0, 0.0, 1e-5] + [5.0, 0.25, 0.0]
+    inputs = model.inputs_of(jnp.asarray(seen.mean(axis=0)), jnp.asarray(seen.var(axis=0)))
+    found = np.asarray(inputs.standardise(jnp.asarray(seen, jnp.float32)))
+    np.testing.assert_allclose(found[:, 0], (seen[:, 0] - seen[:, 0].mean()) / seen[:, 0].std(), atol=1e-4)
+    assert np.all(np.abs(found[:, 1]) < 1e-3) and 0 < np.abs(found[:, 2]).max() < 0.1
+    assert inputs.standardise(jnp.array([5.0, 1e6, -1e6])).tolist()[1:] == [10, -10]
+
+
+def test_a_standardised_model_is_rewarded_and_fitted_as_a_plain_one_on_standardised_observations():
+    """Its labels' observations are given as they come."""
+    inputs = model.Inputs(jnp.array([0.5, -1.0, 0.0]), jnp.array([2.0, 0.5, 1.0]))
+    plain, pairs = model_of(1), labelled_of(mixed(12))
+    by_hand = pairs._replace(observation=(np.asarray(pairs.observation) - [0.5, -1, 0]) / np.array([2, 0.5, 1]))
+    found = model.rewards(plain.members, pairs.observation, pairs.action, inputs)
+    expected = model.rewards(plain.members, by_hand.observation, by_hand.action)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    fitted, _ = fit()(plain._replace(inputs=inputs), pairs, jax.random.key(0), ONE_EPOCH._replace(epochs=5))
+    other, _ = fit()(plain, by_hand, jax.random.key(0), ONE_EPOCH._replace(epochs=5))
+    assert_same(fitted.inputs, inputs)
+    for one, two in zip(flat(fitted.members), flat(other.members), strict=True):
+        np.testing.assert_allclose(one, two, atol=1e-5)
+
+
 @pytest.mark.parametrize("size_in", [4, 25])
 def test_layers_begin_uniform_within_one_over_the_root_of_their_inputs(size_in: int):
     weight, bias = fan_in_uniform(jax.random.key(0), size_in, 3000)

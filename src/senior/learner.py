@@ -105,8 +105,6 @@ class Learner:
     def _init(self, seed: Int[Array, ""]) -> Run:
         config, spec, nets = self.config, self.spec, self.config.networks
         key_agent, key_model = jax.random.split(jax.random.fold_in(jax.random.key(seed), Purpose.INIT))
-        learns = config.method.learns_reward
-        size_in = spec.observation_size + spec.action_size
         until, neighbours = config.pretraining.until, config.pretraining.neighbours
         entropy, deviation = state_entropy.init(until, spec.observation_size, neighbours) if until else (None, None)
         return Run(
@@ -120,9 +118,7 @@ class Learner:
                 nets.width,
                 config.sac.initial_alpha,
             ),
-            model=model.init(key_model, config.reward.members, size_in, nets.reward_layers, nets.reward_width)
-            if learns
-            else None,
+            model=self._new_model(key_model) if config.method.learns_reward else None,
             replay=replay_.init(config.capacity, spec.observation_size, spec.action_size),
             entropy=entropy,
             deviation=deviation,
@@ -130,6 +126,11 @@ class Learner:
             length_scale=jnp.float32(spec.length_scale or 1.0),
             learned_return=jnp.zeros(()),
         )
+
+    def _new_model(self, key: PRNGKeyArray) -> model.RewardModel:
+        reward, nets, size = self.config.reward, self.config.networks, self.spec.observation_size
+        new = model.init(key, reward.members, size + self.spec.action_size, nets.reward_layers, nets.reward_width)
+        return new._replace(inputs=model.Inputs(jnp.zeros(size), jnp.ones(size))) if reward.standardise else new
 
     # Every step.
 
@@ -187,14 +188,17 @@ class Learner:
         self, run: Run, observation: Float[Array, "p 2 H o"], action: Float[Array, "p 2 H a"]
     ) -> tuple[Run, Float[Array, "members p 2"]]:
         """Every member's sum of rewards of each segment: the logits of Eq. 1."""
-        return run, model.rewards(_some(run.model).members, observation, action).sum(axis=-1)
+        learned = _some(run.model)
+        return run, model.rewards(learned.members, observation, action, learned.inputs).sum(axis=-1)
 
     def fit(self, run: Run, labelled: model.Labelled, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
         """Fit the reward model to all labels and relabel the replay."""
         key = _key(run, Purpose.FIT, step)
-        reward = self.config.reward
+        reward, learned = self.config.reward, _some(run.model)
+        if reward.standardise:
+            learned = learned._replace(inputs=model.inputs_of(*replay_.moments(run.replay)))
         snippets = model.Snippets(reward.snippets, reward.snippet_min, reward.snippet_max) if reward.snippets else None
-        fitted, info = model.fit(_some(run.model), labelled, key, reward.batch, run.numbers.fit, snippets)
+        fitted, info = model.fit(learned, labelled, key, reward.batch, run.numbers.fit, snippets)
         return self.relabel(run._replace(model=fitted))[0], info
 
     def on_session(
@@ -230,12 +234,8 @@ class Learner:
         In Meta-World the unit is a metre, ten times the spread of the hand's places; so a bandwidth means the
         same share of the visited space everywhere.
         """
-        filled = jnp.arange(run.replay.capacity) < run.replay.filled
-        position = run.replay.facts.observation[:, self.spec.position]
-        total = jnp.maximum(filled.sum(), 1)
-        mean = jnp.sum(position * filled[:, None], axis=0) / total
-        variance = jnp.sum(((position - mean) ** 2) * filled[:, None], axis=0) / total
-        scale = jnp.maximum(10 * jnp.sqrt(variance.mean()), 1e-6)
+        _, variance = replay_.moments(run.replay)
+        scale = jnp.maximum(10 * jnp.sqrt(variance[self.spec.position].mean()), 1e-6)
         return run._replace(length_scale=scale), scale
 
     # Shared by the above.
@@ -303,7 +303,7 @@ class Learner:
         if run.model is None:
             nothing = jnp.zeros(observation.shape[:-1])
             return nothing, nothing
-        all_members = model.rewards(run.model.members, observation, action)
+        all_members = model.rewards(run.model.members, observation, action, run.model.inputs)
         return all_members.mean(axis=0), all_members.std(axis=0)
 
     def relabel(self, run: Run) -> tuple[Run, None]:

@@ -91,7 +91,7 @@ def quick(task: str, row: Method) -> Config:
     return replace(
         config,
         queries=replace(config.queries, budget=250, per_session=25, every=2500),
-        reward=replace(config.reward, epochs=max(config.reward.epochs, 50)),
+        reward=replace(config.reward, epochs=max(config.reward.epochs, 50), standardise=True),
         pge=replace(config.pge, every=500),
         bilevel=Bilevel(every=5000),
     )

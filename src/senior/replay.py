@@ -128,6 +128,15 @@ def segments(replay: Replay, starts: Int[Array, "*p"], length: int) -> tuple[Arr
     return replay.facts.observation[rows], replay.facts.action[rows], replay.facts.reward[rows]
 
 
+def moments(replay: Replay) -> tuple[Float[Array, " o"], Float[Array, " o"]]:
+    """Mean and variance of every entry of the stored observations."""
+    filled = (jnp.arange(replay.capacity) < replay.filled)[:, None]
+    total = jnp.maximum(replay.filled, 1)
+    observation = replay.facts.observation
+    mean = jnp.sum(observation * filled, axis=0) / total
+    return mean, jnp.sum((observation - mean) ** 2 * filled, axis=0) / total
+
+
 def relabel(replay: Replay, score: Scorer) -> Replay:
     """Rewrite the derived columns of every filled row, chunk by chunk (PEBBLE's relabelling).
 

@@ -2,6 +2,7 @@
 
 Each member is a perceptron on (observation, action) with LeakyReLU and a tanh at its end; the learned reward
 is the mean over the members, in [-1, 1]. The logit of a segment is the plain sum of its rewards.
+Observations enter as they come (the papers), or standardised (ours: `Inputs`).
 """
 
 from __future__ import annotations
@@ -20,12 +21,34 @@ PART = 32
 """Pairs whose gradient is computed at a time; those of a mini-batch are added up. A fit costs what its labels cost."""
 
 
+FARTHEST = 10.0
+"""Deviations beyond which a standardised entry is cut off: what hardly moved so far may move at last."""
+
+
+class Inputs(NamedTuple):
+    """What standardises observations before they enter the members."""
+
+    mean: Float[Array, " o"]
+    deviation: Float[Array, " o"]
+
+    def standardise(self, observation: Float[Array, "*b o"]) -> Float[Array, "*b o"]:
+        """Every entry in deviations from its mean, within ``FARTHEST``."""
+        return jnp.clip((observation - self.mean) / self.deviation, -FARTHEST, FARTHEST)
+
+
+def inputs_of(mean: Float[Array, " o"], variance: Float[Array, " o"]) -> Inputs:
+    """Entries whose deviation is less than a thousandth of the largest count as if they had that much."""
+    deviation = jnp.sqrt(variance)
+    return Inputs(mean, jnp.maximum(deviation, jnp.maximum(1e-3 * deviation.max(), 1e-8)))
+
+
 class RewardModel(NamedTuple):
     """Members (leading axis) with one Adam over all of them, and the outer step's own Adam where it has one."""
 
     members: MLP
     adam: optax.OptState
     outer_adam: optax.OptState
+    inputs: Inputs | None = None  # None: observations enter as they come
 
 
 class Labelled(NamedTuple):
@@ -73,17 +96,21 @@ def init(key: PRNGKeyArray, members: int, size_in: int, layers: int, width: int)
     return RewardModel(made, adam.init(made), adam.init(made))  # pyright: ignore[reportArgumentType]
 
 
-def member_reward(member: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"]) -> Float[Array, "*b"]:
+def member_reward(
+    member: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"], inputs: Inputs | None = None
+) -> Float[Array, "*b"]:
     """Reward of one member, in [-1, 1]."""
+    if inputs is not None:
+        observation = inputs.standardise(observation)
     x = jnp.concatenate([observation, action], axis=-1)
     return jnp.tanh(apply_mlp(member, x, jax.nn.leaky_relu)[..., 0])
 
 
 def rewards(
-    members: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"]
+    members: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"], inputs: Inputs | None = None
 ) -> Float[Array, "members ..."]:
     """Reward of every member."""
-    return jax.vmap(member_reward, in_axes=(0, None, None))(members, observation, action)
+    return jax.vmap(member_reward, in_axes=(0, None, None, None))(members, observation, action, inputs)
 
 
 def targets(label: Int[Array, " n"]) -> Float[Array, "n 2"]:
@@ -128,7 +155,7 @@ def fit(
         """Summed over members, weighted over pairs; and how many predictions were right."""
 
         def of_member(member: MLP, own: Int[Array, " b"], key: PRNGKeyArray) -> tuple[Array, Array]:
-            reward = member_reward(member, labelled.observation[own], labelled.action[own])
+            reward = member_reward(member, labelled.observation[own], labelled.action[own], model.inputs)
             logits = window_sums(reward, snippets, key) if snippets else reward.sum(axis=-1)[:, None]  # [b, copies, 2]
             right = (logits[..., 1] > logits[..., 0]) == (labelled.label[own] == Preferred.SECOND)[:, None]
             counted = right.mean(axis=1) * ((weight > 0) & (labelled.label[own] != Preferred.EQUAL))
