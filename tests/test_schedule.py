@@ -110,10 +110,10 @@ def test_sessions_queries_outer_steps_and_refreshes_of_a_million_steps(task: str
 def test_the_quick_presets_run_is_the_same_on_every_task(task: str, method: str):
     row, counts = METHODS[method], plan(preset("quick", task, method))
     if method == "sac":
-        assert counts == Counts(0, 0, 0, 0, 0, 0, 2 * (60_000 - 1001))
+        assert counts == Counts(0, 0, 0, 0, 0, 0, 2 * (80_000 - 1001))
         return
     bilevel, pge = row.outer == "bilevel", row.explore == "preference_guided"
-    assert counts == Counts(10, 250, 32_500, 4 * bilevel, 100 * pge, 8999, 2 * (50_000 - 1) + 100)
+    assert counts == Counts(10, 250, 32_500, 4 * bilevel, 140 * pge, 8999, 2 * (70_000 - 1) + 100)
 
 
 @pytest.mark.parametrize(

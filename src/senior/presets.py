@@ -80,9 +80,9 @@ def quick(task: str, row: Method) -> Config:
     config = replace(
         config,
         preset="quick",
-        steps=60_000,
+        steps=80_000,
         networks=small,
-        sac=SAC(batch=128, critic_rate=1e-3, alpha_rate=3e-4, rate_end=0.0, updates=2),
+        sac=SAC(batch=128, actor_rate=1e-3, critic_rate=1e-3, alpha_rate=3e-4, rate_end=0.0, updates=2),
         snapshot_every=10_000,
         evaluation=Evaluation(every=5000),
     )
