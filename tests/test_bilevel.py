@@ -11,7 +11,7 @@ from senior.agent import sac
 from senior.agent.networks import MLP
 from senior.reward import bilevel, model
 from senior.reward.bilevel import FirstSteps, OuterNumbers
-from senior.reward.model import Inputs, RewardModel, rewards
+from senior.reward.model import RewardModel, Scaling
 from senior.types import Batch, Preferred, Source
 from tests.numeric import Arrays, numeric_gradient
 
@@ -158,25 +158,24 @@ def test_the_outer_gradient_is_that_of_differences_through_the_inner_step(
         np.testing.assert_allclose((new - old)[clear], -1e-3 * np.sign(g[clear]), rtol=2e-2)
 
 
-def test_the_outer_step_sees_the_reward_of_standardised_observations(agent: sac.Agent, reward_model: RewardModel):
-    """With the critics' value of the next state out of it, the observations enter the learned reward alone."""
+def test_a_standardising_model_and_one_with_the_scaling_in_its_first_layer_give_the_same_outer_loss(
+    agent: sac.Agent, reward_model: RewardModel
+):
     batch, pairs = batch_of(), pairs_of([FIRST, SECOND])
-    inputs = Inputs(jnp.full(O, 0.5), jnp.full(O, 2.0))
-    after, info = outer_step(reward_model._replace(inputs=inputs), agent, batch, pairs, KEY, NUMBERS, False)
-    value = jax.lax.stop_gradient(sac.next_value(agent, batch, KEY))
-    learned = rewards(reward_model.members, (batch.observation - 0.5) / 2, batch.action).mean(axis=0)
-    reward_as_value = batch._replace(bootstrap=jnp.ones(B))
-    silent = jax.tree.map(jnp.zeros_like, reward_model.members)
-    expected = bilevel.outer_loss(
-        silent,
-        agent.critics,
-        reward_as_value,
-        learned / NUMBERS.discount + batch.bootstrap * value,
-        pairs,
-        NUMBERS,
+    scaling = Scaling(jnp.full(O, 0.5), jnp.full(O, 2.0))
+    members = reward_model.members
+    first = members.weights[0]  # [member, O + A, width]
+    scaled = first.at[:, :O].divide(2)
+    shift = 0.5 * scaled[:, :O].sum(axis=1)
+    folded = members._replace(
+        weights=(scaled, *members.weights[1:]), biases=(members.biases[0] - shift, *members.biases[1:])
     )
-    np.testing.assert_allclose(info["outer_loss"], expected, rtol=1e-5)
-    assert_same(after.inputs, inputs)
+    _, plain = outer_step(reward_model, agent, batch, pairs, KEY, NUMBERS, False)
+    _, expected = outer_step(reward_model._replace(members=folded), agent, batch, pairs, KEY, NUMBERS, False)
+    after, info = outer_step(reward_model._replace(scaling=scaling), agent, batch, pairs, KEY, NUMBERS, False)
+    np.testing.assert_allclose(info["outer_loss"], expected["outer_loss"], rtol=1e-5)
+    assert abs(plain["outer_loss"] - expected["outer_loss"]) > 1e-5 * expected["outer_loss"]
+    assert_same(after.scaling, scaling)
 
 
 def test_the_learned_reward_moves_so_that_the_outer_loss_falls(agent: sac.Agent, reward_model: RewardModel):

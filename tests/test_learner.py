@@ -270,7 +270,7 @@ def test_the_outer_step_changes_the_reward_model_relabels_everything_and_leaves_
         (curious.replay.facts, run.replay, FACTS),
         (curious.bonus.curiosity, run.bonus.curiosity, CONFIG.pge.capacity),
     ):
-        said = np.asarray(rewards(run.model.members, before.observation[:filled], before.action[:filled]))
+        said = np.asarray(rewards(run.model.members, before.observation[:filled], before.action[:filled], None))
         np.testing.assert_allclose(fresh.learned_reward[:filled], said.mean(axis=0), atol=1e-6)
         np.testing.assert_allclose(fresh.spread[:filled], said.std(axis=0), atol=1e-6)
         assert not np.any(fresh.learned_reward[filled:])
@@ -315,35 +315,44 @@ def test_the_length_scale_is_ten_times_the_spread_of_the_positions_that_are_stor
     assert told == run.length_scale
 
 
+# The fit.
+
+
+def test_every_fit_standardises_by_what_is_stored_and_scores_replay_and_curiosity_buffer_so(curious: Run):
+    """Once with 150 facts, and once more with 30 others."""
+    learner = make_learner(replace(CONFIG, reward=replace(CONFIG.reward, standardise=True)))
+    new = learner.init(3)
+    assert new.model and new.model.scaling is not None
+    rng, capacity = np.random.default_rng(0), CONFIG.queries.budget
+    labelled = Labelled(
+        rng.normal(size=(capacity, 2, SEGMENT, 4)).astype(np.float32),  # pyright: ignore[reportArgumentType]
+        rng.uniform(-1, 1, (capacity, 2, SEGMENT, 2)).astype(np.float32),  # pyright: ignore[reportArgumentType]
+        np.zeros(capacity, np.int32),  # pyright: ignore[reportArgumentType]
+        np.int32(8),  # pyright: ignore[reportArgumentType]
+    )
+    run, count = curious._replace(model=new.model), FACTS
+    for more in (0, 30):
+        for i in range(count, count + more):
+            run, _ = after(learner.store, run, fact(i))
+        count += more
+        run, _ = after(learner.fit, run, labelled, np.int32(UNTIL))
+        stored, action = run.replay.facts.observation[:count], run.replay.facts.action[:count]
+        mean, deviation = stored.mean(axis=0), stored.std(axis=0)
+        np.testing.assert_allclose(run.model.scaling.mean, mean, atol=1e-5)
+        np.testing.assert_allclose(run.model.scaling.deviation, deviation, rtol=1e-4)
+        expected = np.asarray(rewards(run.model.members, (stored - mean) / deviation, action, None))
+        np.testing.assert_allclose(run.replay.learned_reward[:count], expected.mean(axis=0), atol=1e-5)
+        held = run.bonus.curiosity
+        paid = rewards(run.model.members, (held.observation - mean) / deviation, held.action, None)
+        np.testing.assert_allclose(held.learned_reward, paid.mean(axis=0), atol=1e-5)
+        _, summed = after(learner.summed_rewards, run, stored[None, None], action[None, None])
+        np.testing.assert_allclose(summed[:, 0, 0], expected.sum(axis=-1), rtol=1e-3, atol=1e-3)
+
+
 # The pairs of the outer step.
 
 
-def test_a_fit_standardises_by_what_is_stored_and_scores_the_replay_so(lived: Run):
-    config = replace(CONFIG, reward=replace(CONFIG.reward, standardise=True))
-    learner = make_learner(config)
-    new = learner.init(3)
-    assert new.model and new.model.inputs is not None
-    run = lived._replace(model=new.model)
-    rng = np.random.default_rng(0)
-    capacity = CONFIG.queries.budget
-    labelled = Labelled(
-        rng.normal(size=(capacity, 2, SEGMENT, 4)).astype(np.float32),
-        rng.uniform(-1, 1, (capacity, 2, SEGMENT, 2)).astype(np.float32),
-        np.zeros(capacity, np.int32),
-        np.int32(8),
-    )  # pyright: ignore[reportArgumentType]
-    fitted, _ = after(learner.fit, run, labelled, np.int32(UNTIL))
-    stored = np.asarray(lived.replay.facts.observation[:FACTS])
-    np.testing.assert_allclose(fitted.model.inputs.mean, stored.mean(axis=0), atol=1e-5)
-    np.testing.assert_allclose(fitted.model.inputs.deviation, stored.std(axis=0), rtol=1e-4)
-    standard = (stored - stored.mean(axis=0)) / stored.std(axis=0)
-    expected = rewards(fitted.model.members, standard, lived.replay.facts.action[:FACTS])
-    np.testing.assert_allclose(fitted.replay.learned_reward[:FACTS], expected.mean(axis=0), atol=1e-5)
-    _, summed = after(learner.summed_rewards, fitted, stored[None, None], lived.replay.facts.action[None, None, :FACTS])
-    np.testing.assert_allclose(summed[:, 0, 0], expected.sum(axis=-1), rtol=1e-3, atol=1e-3)
-
-
-def test_the_latest_labelled_pairs_are_those_of_one_session_and_padded_without_weight(tmp_path: Path):
+def test_the_pairs_are_the_latest_that_were_labelled_and_padded_without_weight(tmp_path: Path):
     rng = np.random.default_rng(4)
     trainee = Trainee(CONFIG, tmp_path, LEARNER)
     observation = rng.normal(size=(16, 2, SEGMENT, 4)).astype(np.float32)
@@ -351,7 +360,7 @@ def test_the_latest_labelled_pairs_are_those_of_one_session_and_padded_without_w
     said = [0, None, -1, 1, 1, 0, None, 1, 0, -1, 1, 0, None, 1, 0, 1]
     labels: list[int] = []
     try:
-        for part in (slice(0, 0), slice(0, 4), slice(4, 16)):
+        for part in (slice(0, 0), slice(0, 4), slice(4, 14), slice(14, 16)):
             numbers = np.zeros((len(said[part]), 2), int)
             reward = np.zeros((*numbers.shape, SEGMENT))
             query = Query(Pairs(observation[part], action[part], reward, numbers, numbers))
@@ -368,7 +377,7 @@ def test_the_latest_labelled_pairs_are_those_of_one_session_and_padded_without_w
             labels.append(len(kept))
     finally:
         trainee.close()
-    assert labels == [0, 3, M]
+    assert labels == [0, 3, M, M]  # the last session has two of its own
 
 
 # Whole runs: the order within a step, and a teacher that skips.

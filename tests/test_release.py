@@ -138,7 +138,7 @@ def test_the_outer_step_takes_the_batch_and_the_values_of_the_steps_own_update()
     batch = tutor._draw(run, key_batch, jnp.int32(0))
     value = sac.next_value(run.agent, batch, jax.random.split(key_update)[0])
     numbers = run.numbers.outer._replace(inner_rate=tutor._decayed(run, jnp.int32(AT)).critic_rate)
-    expected = bilevel.outer_loss(run.model.members, run.agent.critics, batch, value, pairs, numbers)
+    expected = bilevel.outer_loss(run.model.members, run.agent.critics, batch, value, pairs, numbers, None)
     np.testing.assert_allclose(info["outer_loss"], expected, rtol=1e-5)
 
 
@@ -171,6 +171,7 @@ def test_a_run_of_it_has_its_batches_its_bonus_and_its_refreshes(tmp_path: Path)
     assert int(last["labels"]) == expected.queried
     assert (int(last["refreshes"]), int(last["outer_steps"])) == (expected.refreshes, expected.outer_steps) == (4, 2)
     assert expected.refreshes == plan(small(steps=1000)).refreshes - 2
+    assert 0 < float(last["beta"]) == pytest.approx(0.1 * 0.99**900, rel=1e-4)
     assert float(last["curiosity_share"]) == pytest.approx(19 / (19 + 44))  # int(0.3 * 64) and int(0.7 * 64)
 
 

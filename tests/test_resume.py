@@ -186,8 +186,9 @@ def test_interrupted_at_awkward_moments(reference: Path, tmp_path: Path):
 
 
 def noisy_qpa() -> Config:
-    """QPA with a teacher that errs, skips and calls equal."""
+    """QPA with standardised observations and a teacher that errs, skips and calls equal."""
     config = small("qpa")
+    config = replace(config, reward=replace(config.reward, standardise=True))
     keep = {
         name: getattr(short(), name) for name in ("steps", "horizon", "replay_capacity", "checkpoint_every", "queries")
     }

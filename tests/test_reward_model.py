@@ -100,7 +100,7 @@ def loss_by_hand(members: Arrays, labelled: Labelled) -> float:
 
 def test_every_member_is_a_leaky_perceptron_with_a_tanh_at_its_end():
     members, pairs = model_of(1).members, labelled_of(mixed(12))
-    found = model.rewards(members, pairs.observation, pairs.action)
+    found = model.rewards(members, pairs.observation, pairs.action, None)
     assert found.shape == (3, 12, 2, H)
     for j in range(3):
         expected = reward_by_hand(flat(members), j, pairs.observation, pairs.action)
@@ -115,7 +115,7 @@ def test_the_slope_below_zero_is_a_hundredth():
 def test_the_learned_reward_stays_in_its_range_however_large_the_weights_are():
     members = jax.tree.map(lambda x: 50 * x, model_of(2).members)
     pairs = labelled_of(mixed(12))
-    every = np.asarray(model.rewards(members, 10 * pairs.observation, pairs.action))
+    every = np.asarray(model.rewards(members, 10 * pairs.observation, pairs.action, None))
     assert np.abs(every).max() > 0.9
     assert np.abs(every.mean(axis=0)).max() <= 1
 
@@ -124,24 +124,24 @@ def test_standardised_entries_have_mean_0_and_deviation_1_within_ten():
     """An entry that never moved, one that hardly did, and one that is far away now."""
     rng = np.random.default_rng(0)
     seen = rng.normal(size=(500, O)) * [2.0, 0.0, 1e-5] + [5.0, 0.25, 0.0]
-    inputs = model.inputs_of(jnp.asarray(seen.mean(axis=0)), jnp.asarray(seen.var(axis=0)))
-    found = np.asarray(inputs.standardise(jnp.asarray(seen, jnp.float32)))
+    scaling = model.Scaling.of(jnp.asarray(seen.mean(axis=0)), jnp.asarray(seen.var(axis=0)))
+    found = np.asarray(scaling.standardise(jnp.asarray(seen, jnp.float32)))
     np.testing.assert_allclose(found[:, 0], (seen[:, 0] - seen[:, 0].mean()) / seen[:, 0].std(), atol=1e-4)
     assert np.all(np.abs(found[:, 1]) < 1e-3) and 0 < np.abs(found[:, 2]).max() < 0.1
-    assert inputs.standardise(jnp.array([5.0, 1e6, -1e6])).tolist()[1:] == [10, -10]
+    assert scaling.standardise(jnp.array([5.0, 1e6, -1e6])).tolist()[1:] == [10, -10]
 
 
 def test_a_standardised_model_is_rewarded_and_fitted_as_a_plain_one_on_standardised_observations():
     """Its labels' observations are given as they come."""
-    inputs = model.Inputs(jnp.array([0.5, -1.0, 0.0]), jnp.array([2.0, 0.5, 1.0]))
+    scaling = model.Scaling(jnp.array([0.5, -1.0, 0.0]), jnp.array([2.0, 0.5, 1.0]))
     plain, pairs = model_of(1), labelled_of(mixed(12))
     by_hand = pairs._replace(observation=(np.asarray(pairs.observation) - [0.5, -1, 0]) / np.array([2, 0.5, 1]))
-    found = model.rewards(plain.members, pairs.observation, pairs.action, inputs)
-    expected = model.rewards(plain.members, by_hand.observation, by_hand.action)
+    found = model.rewards(plain.members, pairs.observation, pairs.action, scaling)
+    expected = model.rewards(plain.members, by_hand.observation, by_hand.action, None)
     np.testing.assert_allclose(found, expected, atol=1e-6)
-    fitted, _ = fit()(plain._replace(inputs=inputs), pairs, jax.random.key(0), ONE_EPOCH._replace(epochs=5))
+    fitted, _ = fit()(plain._replace(scaling=scaling), pairs, jax.random.key(0), ONE_EPOCH._replace(epochs=5))
     other, _ = fit()(plain, by_hand, jax.random.key(0), ONE_EPOCH._replace(epochs=5))
-    assert_same(fitted.inputs, inputs)
+    assert_same(fitted.scaling, scaling)
     for one, two in zip(flat(fitted.members), flat(other.members), strict=True):
         np.testing.assert_allclose(one, two, atol=1e-5)
 
@@ -349,6 +349,6 @@ def test_a_linear_preference_is_learned_and_foretold_for_new_pairs():
     labelled = Labelled(observation[:train], action[:train], label[:train], np.int32(train))  # pyright: ignore
     numbers = FitNumbers(rate=1e-2, epochs=30, stop_accuracy=0.97)
     fitted, info = fit(64)(model_of(15, width=8), labelled, jax.random.key(11), numbers)
-    summed = model.rewards(fitted.members, observation[train:], action[train:]).mean(axis=0).sum(axis=-1)
+    summed = model.rewards(fitted.members, observation[train:], action[train:], None).mean(axis=0).sum(axis=-1)
     foretold = (np.asarray(summed[:, 1] > summed[:, 0]) == label[train:]).mean()
     assert info["fit_accuracy"] > 0.97 and foretold > 0.9

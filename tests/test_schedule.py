@@ -96,7 +96,11 @@ def test_sessions_queries_outer_steps_and_refreshes_of_a_million_steps(task: str
     assert config.reward.snippets == (20 if method == "qpa" and not original else 0)
     weight = (config.rune.beta, config.rune.decay) if row.explore == "disagreement" else (0.05, 1e-5)
     assert weight == (0.05, 1e-5)
-    assert (config.pge.beta, config.pge.decay, config.pge.share, config.mds.keep) == (0.1, 0.01, 0.3, 0.3)
+    pge, mds, outer_step = config.pge, config.mds, config.bilevel
+    assert (pge.beta, pge.decay, pge.share, pge.bandwidth, pge.capacity) == (0.1, 0.01, 0.3, 0.1, 1000)
+    assert (pge.clock, mds.axis, mds.density_sum) == ("refresh", "oriented", "density")
+    assert (mds.keep, mds.bandwidth, config.queries.pool) == (0.3, 0.05, 10)
+    assert (outer_step.weight, outer_step.optimizer, outer_step.batch) == (0.1, "shared", "uniform")
     networks, sac = config.networks, config.sac
     assert (networks.layers, networks.width, sac.batch) == ((2, 1024, 1024) if original else (3, 256, 512))
     rates = (sac.actor_rate, sac.critic_rate, sac.alpha_rate)

@@ -158,7 +158,14 @@ def mds(positions: np.ndarray, n: int, **options: Any) -> Selection:
 @pytest.mark.parametrize("seed", [3, 4, 5])
 @pytest.mark.parametrize(
     "options",
-    [{}, {"keep": 0.6, "bandwidth": 0.02}, {"axis": "absolute"}, {"density_sum": "log"}, {"keep": 0.1}],
+    [
+        {},
+        {"keep": 0.6, "bandwidth": 0.02},
+        {"axis": "absolute"},
+        {"density_sum": "log"},
+        {"density_sum": "log", "bandwidth": 0.194},
+        {"keep": 0.1},
+    ],
     ids=str,
 )
 def test_mds_chooses_what_the_equations_choose(seed: int, options: dict[str, Any]):
@@ -175,6 +182,9 @@ def test_mds_chooses_what_the_equations_choose(seed: int, options: dict[str, Any
     chosen = mds(positions, n, **options)
     assert chosen.index.tolist() == index
     np.testing.assert_allclose(chosen.scores["d"], d, atol=1e-5)
+    if options.get("bandwidth") == 0.194:  # sums of both signs: sorting by 1/sum would choose others
+        all_sums = motion_sum(positions, 0.194 * SCALE, "log")
+        assert all_sums.min() < 0 < all_sums.max()
     m = [-t for t in total] if log else [1 / t for t in total]
     np.testing.assert_allclose(chosen.scores["m"], m, rtol=1e-3)
 

@@ -102,8 +102,8 @@ class Reward:
     stop_accuracy: float = 0.97
     """A session's fit ends after an epoch with more training accuracy than this."""
     standardise: bool = False
-    """Bring every entry of the observation to mean 0 and deviation 1 (over the replay, taken anew for every fit)
-    before the reward model sees it. The papers do not."""
+    """Bring every entry of the observation to mean 0 and deviation 1 (over the replay, taken anew for every fit; within
+    10, and what hardly varies stays small) before the reward model sees it. The papers do not."""
     snippets: int = 0
     """Random windows that stand for each pair in a fit (QPA's data augmentation, tau). 0: the whole segments."""
     snippet_min: int = 35

@@ -128,9 +128,10 @@ class Learner:
         )
 
     def _new_model(self, key: PRNGKeyArray) -> model.RewardModel:
+        """Where it standardises, observations enter as they come (but for the cut) until the first fit."""
         reward, nets, size = self.config.reward, self.config.networks, self.spec.observation_size
         new = model.init(key, reward.members, size + self.spec.action_size, nets.reward_layers, nets.reward_width)
-        return new._replace(inputs=model.Inputs(jnp.zeros(size), jnp.ones(size))) if reward.standardise else new
+        return new._replace(scaling=model.Scaling(jnp.zeros(size), jnp.ones(size))) if reward.standardise else new
 
     # Every step.
 
@@ -189,14 +190,14 @@ class Learner:
     ) -> tuple[Run, Float[Array, "members p 2"]]:
         """Every member's sum of rewards of each segment: the logits of Eq. 1."""
         learned = _some(run.model)
-        return run, model.rewards(learned.members, observation, action, learned.inputs).sum(axis=-1)
+        return run, model.rewards(learned.members, observation, action, learned.scaling).sum(axis=-1)
 
     def fit(self, run: Run, labelled: model.Labelled, step: Int[Array, ""]) -> tuple[Run, dict[str, Array]]:
         """Fit the reward model to all labels and relabel the replay."""
         key = _key(run, Purpose.FIT, step)
         reward, learned = self.config.reward, _some(run.model)
         if reward.standardise:
-            learned = learned._replace(inputs=model.inputs_of(*replay_.moments(run.replay)))
+            learned = learned._replace(scaling=model.Scaling.of(*replay_.moments(run.replay)))
         snippets = model.Snippets(reward.snippets, reward.snippet_min, reward.snippet_max) if reward.snippets else None
         fitted, info = model.fit(learned, labelled, key, reward.batch, run.numbers.fit, snippets)
         return self.relabel(run._replace(model=fitted))[0], info
@@ -303,7 +304,7 @@ class Learner:
         if run.model is None:
             nothing = jnp.zeros(observation.shape[:-1])
             return nothing, nothing
-        all_members = model.rewards(run.model.members, observation, action, run.model.inputs)
+        all_members = model.rewards(run.model.members, observation, action, run.model.scaling)
         return all_members.mean(axis=0), all_members.std(axis=0)
 
     def relabel(self, run: Run) -> tuple[Run, None]:

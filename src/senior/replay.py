@@ -129,7 +129,7 @@ def segments(replay: Replay, starts: Int[Array, "*p"], length: int) -> tuple[Arr
 
 
 def moments(replay: Replay) -> tuple[Float[Array, " o"], Float[Array, " o"]]:
-    """Mean and variance of every entry of the stored observations."""
+    """Mean and population variance ``[o]`` of every entry of the stored observations; zeros if there is none."""
     filled = (jnp.arange(replay.capacity) < replay.filled)[:, None]
     total = jnp.maximum(replay.filled, 1)
     observation = replay.facts.observation

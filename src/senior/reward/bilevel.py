@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from senior.agent import sac
 from senior.agent.networks import MLP, Activation, descend
-from senior.reward.model import Inputs, RewardModel, cross_entropy, rewards, targets
+from senior.reward.model import RewardModel, Scaling, cross_entropy, rewards, targets
 from senior.types import Batch
 
 
@@ -46,11 +46,14 @@ def outer_loss(
     next_value: Float[Array, " b"],
     pairs: FirstSteps,
     numbers: OuterNumbers,
+    scaling: Scaling | None,
     activation: Activation = jax.nn.relu,
-    inputs: Inputs | None = None,
 ) -> Float[Array, ""]:
-    """Preference loss of critics moved one step by the learned reward; differentiable in ``members``."""
-    reward = rewards(members, batch.observation, batch.action, inputs).mean(axis=0)
+    """Preference loss of critics moved one step by the learned reward; differentiable in ``members``.
+
+    scaling: the reward model's.
+    """
+    reward = rewards(members, batch.observation, batch.action, scaling).mean(axis=0)
     target = reward + numbers.discount * batch.bootstrap * next_value
 
     def inner_loss(critics: MLP) -> Array:
@@ -81,7 +84,7 @@ def outer_step(
     """
     next_value = jax.lax.stop_gradient(sac.next_value(agent, batch, key, activation))
     loss, gradient = jax.value_and_grad(outer_loss)(
-        model.members, agent.critics, batch, next_value, pairs, numbers, activation, model.inputs
+        model.members, agent.critics, batch, next_value, pairs, numbers, model.scaling, activation
     )
     state = model.outer_adam if separate else model.adam
     members, state = descend(model.members, gradient, state, numbers.rate)

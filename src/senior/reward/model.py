@@ -2,7 +2,7 @@
 
 Each member is a perceptron on (observation, action) with LeakyReLU and a tanh at its end; the learned reward
 is the mean over the members, in [-1, 1]. The logit of a segment is the plain sum of its rewards.
-Observations enter as they come (the papers), or standardised (ours: `Inputs`).
+Observations enter as they come (the papers), or standardised (ours: `Scaling`).
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from senior.types import Preferred
 PART = 32
 """Pairs whose gradient is computed at a time; those of a mini-batch are added up. A fit costs what its labels cost."""
 
-
 FARTHEST = 10.0
 """Deviations beyond which a standardised entry is cut off: what hardly moved so far may move at last."""
 
 
-class Inputs(NamedTuple):
-    """What standardises observations before they enter the members."""
+class Scaling(NamedTuple):
+    """What standardises observations before they enter the members (not in the papers)."""
 
     mean: Float[Array, " o"]
     deviation: Float[Array, " o"]
 
+    @classmethod
+    def of(cls, mean: Float[Array, " o"], variance: Float[Array, " o"]) -> Scaling:
+        """By those moments. An entry that deviates less than a thousandth of what the most varied one does counts as
+        if it did that much, so that the noise of what stands still remains small."""
+        deviation = jnp.sqrt(variance)
+        return cls(mean, jnp.maximum(deviation, jnp.maximum(1e-3 * deviation.max(), 1e-8)))
+
     def standardise(self, observation: Float[Array, "*b o"]) -> Float[Array, "*b o"]:
         """Every entry in deviations from its mean, within ``FARTHEST``."""
         return jnp.clip((observation - self.mean) / self.deviation, -FARTHEST, FARTHEST)
-
-
-def inputs_of(mean: Float[Array, " o"], variance: Float[Array, " o"]) -> Inputs:
-    """Entries whose deviation is less than a thousandth of the largest count as if they had that much."""
-    deviation = jnp.sqrt(variance)
-    return Inputs(mean, jnp.maximum(deviation, jnp.maximum(1e-3 * deviation.max(), 1e-8)))
 
 
 class RewardModel(NamedTuple):
@@ -48,7 +48,7 @@ class RewardModel(NamedTuple):
     members: MLP
     adam: optax.OptState
     outer_adam: optax.OptState
-    inputs: Inputs | None = None  # None: observations enter as they come
+    scaling: Scaling | None = None  # None: observations enter as they come
 
 
 class Labelled(NamedTuple):
@@ -97,20 +97,20 @@ def init(key: PRNGKeyArray, members: int, size_in: int, layers: int, width: int)
 
 
 def member_reward(
-    member: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"], inputs: Inputs | None = None
+    member: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"], scaling: Scaling | None
 ) -> Float[Array, "*b"]:
-    """Reward of one member, in [-1, 1]."""
-    if inputs is not None:
-        observation = inputs.standardise(observation)
+    """Reward of one member, in [-1, 1]. ``scaling`` None: observations enter as they come."""
+    if scaling is not None:
+        observation = scaling.standardise(observation)
     x = jnp.concatenate([observation, action], axis=-1)
     return jnp.tanh(apply_mlp(member, x, jax.nn.leaky_relu)[..., 0])
 
 
 def rewards(
-    members: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"], inputs: Inputs | None = None
+    members: MLP, observation: Float[Array, "*b o"], action: Float[Array, "*b a"], scaling: Scaling | None
 ) -> Float[Array, "members ..."]:
-    """Reward of every member."""
-    return jax.vmap(member_reward, in_axes=(0, None, None, None))(members, observation, action, inputs)
+    """Reward of every member; ``scaling`` as in `member_reward`."""
+    return jax.vmap(member_reward, in_axes=(0, None, None, None))(members, observation, action, scaling)
 
 
 def targets(label: Int[Array, " n"]) -> Float[Array, "n 2"]:
@@ -146,6 +146,7 @@ def fit(
     part = min(PART, batch)
     count = labelled.count
     n_members = model.members.weights[0].shape[0]
+    scaling = model.scaling
     target = targets(labelled.label)
     decided = jnp.sum((labelled.label != Preferred.EQUAL) & (jnp.arange(capacity) < count))
 
@@ -155,7 +156,7 @@ def fit(
         """Summed over members, weighted over pairs; and how many predictions were right."""
 
         def of_member(member: MLP, own: Int[Array, " b"], key: PRNGKeyArray) -> tuple[Array, Array]:
-            reward = member_reward(member, labelled.observation[own], labelled.action[own], model.inputs)
+            reward = member_reward(member, labelled.observation[own], labelled.action[own], scaling)
             logits = window_sums(reward, snippets, key) if snippets else reward.sum(axis=-1)[:, None]  # [b, copies, 2]
             right = (logits[..., 1] > logits[..., 0]) == (labelled.label[own] == Preferred.SECOND)[:, None]
             counted = right.mean(axis=1) * ((weight > 0) & (labelled.label[own] != Preferred.EQUAL))
