@@ -67,7 +67,7 @@ def test_nothing_compiles_after_warm_up_the_cut_last_session_included(tmp_path: 
 
 
 def test_vmap_and_the_loop_compute_the_same(tmp_path: Path):
-    config = replace(short(), reward=replace(short().reward, standardise=True))
+    config = short()
     learner = make_learner(config)
     trained = train(config, tmp_path, seeds=2)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -25,10 +23,9 @@ from senior.program import make_environment
 from senior.replay import Fact
 from senior.reward import bilevel
 from senior.reward.bilevel import FirstSteps
-from senior.schedule import plan
 from senior.select.motion_distinction import motion_sum
 from senior.types import Answers, BadInput, Pairs, Query, Source
-from tests.small import rows, small
+from tests.small import small
 from tests.test_select import mds, strokes
 
 FACTS, AT = 300, 10_000
@@ -154,25 +151,6 @@ def test_an_equal_pair_adds_its_second_segment_to_the_preferred_positions(tmp_pa
     theirs, count = preferences.preferred_positions(slice(0, 2), "second")
     assert np.array_equal(theirs[:count].reshape(-1, 3, 2), [observation[0, 0], observation[1, 1], observation[2, 1]])
     preferences.close()
-
-
-def test_a_run_of_it_has_its_batches_its_bonus_and_its_refreshes(tmp_path: Path):
-    """In a process of its own: XLA crashed twice in this run when the process had compiled hundreds of programs."""
-    program = (
-        "import sys; from pathlib import Path; from senior.presets import release; from senior.program import train; "
-        "from tests.small import small; train(release(small(steps=1000)), Path(sys.argv[1]))"
-    )
-    root = Path(__file__).parent.parent
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path)], cwd=root, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    expected, last = plan(release(small(steps=1000))), rows(tmp_path / "seed-0" / "train.csv")[-1]
-    assert int(last["labels"]) == expected.queried
-    assert (int(last["refreshes"]), int(last["outer_steps"])) == (expected.refreshes, expected.outer_steps) == (4, 2)
-    assert expected.refreshes == plan(small(steps=1000)).refreshes - 2
-    assert 0 < float(last["beta"]) == pytest.approx(0.1 * 0.99**900, rel=1e-4)
-    assert float(last["curiosity_share"]) == pytest.approx(19 / (19 + 44))  # int(0.3 * 64) and int(0.7 * 64)
 
 
 def test_the_label_says_what_it_is():
