@@ -54,5 +54,5 @@ def make(
         return point.make(horizon or point.HORIZON)
     if horizon is not None and horizon > metaworld.HORIZON:
         raise BadInput(f"--horizon {horizon} is more than the {metaworld.HORIZON} steps of a Meta-World episode.")
-    built, spec = metaworld.make(task)
+    built, spec = metaworld.make(task, render)
     return built, replace(spec, horizon=horizon or spec.horizon)

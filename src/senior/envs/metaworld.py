@@ -2,8 +2,8 @@
 
 One environment is one task, with the object elsewhere in every episode.
 
-The stock environment is the truth: observations, rewards and success are its own, bit for bit. Known
-peculiarities of it are kept, because published numbers contain them:
+The stock environment is the truth: observations, rewards and success are its own, bit for bit (`senior.envs.lean`
+makes them in less time). Known peculiarities of it are kept, because published numbers contain them:
 
 * several "initial" positions in the rewards are live views of the simulator's state, not copies, so that
   the reach term of door-lock is measured against the current distance (about 1.08 at the first step);
@@ -64,8 +64,8 @@ class MetaWorld(gymnasium.Env[np.ndarray, np.ndarray]):
 
     metadata = {"render_modes": [], "render_fps": 80}  # noqa: RUF012  (Gymnasium's declaration)
 
-    def __init__(self, task: str, reward_function_version: str = REWARD_FUNCTION_VERSION) -> None:
-        """Raises `BadInput` for an unknown task and for any reward but v2."""
+    def __init__(self, task: str, reward_function_version: str = REWARD_FUNCTION_VERSION, render: bool = False) -> None:
+        """``render``: keep what is only there to be seen. Raises `BadInput` for an unknown task, any reward but v2."""
         if task not in TASKS:
             raise BadInput.unknown("task", task, TASKS)
         if reward_function_version != REWARD_FUNCTION_VERSION:
@@ -77,7 +77,10 @@ class MetaWorld(gymnasium.Env[np.ndarray, np.ndarray]):
         os.environ.setdefault("MUJOCO_GL", "off")
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
-        stock: Any = ALL_V3_ENVIRONMENTS[f"{task}-v3"](reward_function_version=reward_function_version)
+        from senior.envs.lean import lean
+
+        kind: Any = ALL_V3_ENVIRONMENTS[f"{task}-v3"]
+        stock = (kind if render else lean(task, kind))(reward_function_version=reward_function_version)
         if TASKS[task].goal_observable:
             stock._partially_observable = False
             del stock.sawyer_observation_space  # cached with bounds that clip the goal to zero
@@ -106,9 +109,9 @@ class MetaWorld(gymnasium.Env[np.ndarray, np.ndarray]):
         self.stock.close()
 
 
-def make(task: str) -> tuple[MetaWorld, EnvSpec]:
-    """The environment of a task and its `EnvSpec`, in metres. Raises `BadInput` for an unknown task."""
-    env = MetaWorld(task)
+def make(task: str, render: bool = False) -> tuple[MetaWorld, EnvSpec]:
+    """The environment of a task, to be drawn or not, and its `EnvSpec`, in metres. `BadInput` for an unknown task."""
+    env = MetaWorld(task, render=render)
     spec = EnvSpec(
         name=task,
         observation_size=39,
