@@ -51,7 +51,7 @@ def imported(name: str, source: str, is_package: bool, known: set[str]) -> Itera
 
 
 def part(name: str) -> str:
-    """The part a module belongs to: ``envs`` for ``senior.envs.vector``, nothing for the package itself."""
+    """The part a module belongs to: ``envs`` for ``senior.envs.episodes``, nothing for the package itself."""
     return name.split(".")[1] if "." in name else ""
 
 

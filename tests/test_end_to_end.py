@@ -75,7 +75,7 @@ def test_vmap_and_the_loop_compute_the_same(tmp_path: Path):
         """The two trained runs, each time anew because a `Runs` gives its arrays away; they fit for one epoch."""
         found = []
         for result in trained:
-            run, _ = checkpoint.restore(result.path / "checkpoints", 1000, learner.init(result.seed))
+            run, _ = checkpoint.restore(result.path / "checkpoints", 1000, learner.init(config))
             fit = run.numbers.fit._replace(epochs=jnp.int32(1))  # rounding grows from epoch to epoch
             found.append(run._replace(numbers=run.numbers._replace(fit=fit)))
         return found

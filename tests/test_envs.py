@@ -18,7 +18,16 @@ from gymnasium.wrappers import TimeLimit
 from senior import envs
 from senior.envs import gymnasium as custom
 from senior.envs import metaworld, point
-from senior.envs.vector import EVALUATION, TRAINING, Environments, Failure, Step, episode_seed
+from senior.envs.episodes import (
+    EVALUATION,
+    TRAINING,
+    Episodes,
+    Failure,
+    Local,
+    Step,
+    episode_seed,
+    restore,
+)
 from senior.types import BadInput, EnvSpec
 
 HERE = __name__
@@ -124,7 +133,7 @@ def test_meta_world_bad_input():
 def test_training_draws_nothing_and_needs_no_jax():
     program = (
         "import sys; sys.modules['jax'] = None\n"
-        "import senior.envs.vector, senior.envs.render, senior.envs as envs\n"
+        "import senior.envs.worker, senior.envs.render, senior.envs as envs\n"
         "assert 'mujoco' not in sys.modules and 'metaworld' not in sys.modules\n"
         "env, _ = envs.make('window-open'); env.reset(seed=0)\n"
         "assert not [name for name in sys.modules if name.startswith('OpenGL')]\n"
@@ -333,7 +342,7 @@ def test_position_is_parsed():
             custom.parse_position(text)
 
 
-# Several at once
+# Episodes
 
 
 def test_episode_seeds_differ_and_stay():
@@ -353,6 +362,11 @@ def taken(step: Step | Failure) -> Step:
     return step
 
 
+def go(place: Episodes, action: np.ndarray) -> Step | Failure:
+    place.send(action)
+    return place.receive()
+
+
 def same(first: list[Step], second: list[Step]) -> bool:
     return len(first) == len(second) and all(
         np.array_equal(a, b) for one, other in zip(first, second, strict=True) for a, b in zip(one, other, strict=True)
@@ -360,20 +374,19 @@ def same(first: list[Step], second: list[Step]) -> bool:
 
 
 def test_every_run_goes_its_own_way():
-    horizons = iter((5, 7))
-    together = Environments(lambda: point.make(next(horizons)), [3, 4], TRAINING)
-    assert together.reset_all() == [None, None]
+    places = [Local(lambda: point.make(5), 3, TRAINING), Local(lambda: point.make(7), 4, TRAINING)]
+    assert [place.begin(0) for place in places] == [None, None]
     actions = wandering(20, 2, seed=0)
     steps: tuple[list[Step], list[Step]] = ([], [])
     for action in actions:
         for run in (1, 0):
-            before = together.observations[run].copy()
-            step = taken(together.step(run, action))
+            before = places[run].observation.copy()
+            step = taken(go(places[run], action))
             np.testing.assert_array_equal(step.observation, before)
             assert step.observation.dtype == step.next_observation.dtype == step.action.dtype == np.float32
             steps[run].append(step)
-    assert together.episodes == [4, 2]
-    assert together.elapsed == [0, 6]
+    assert [place.episode for place in places] == [4, 2]
+    assert [place.elapsed for place in places] == [0, 6]
     assert [number for number, step in enumerate(steps[0], 1) if step.truncated] == [5, 10, 15, 20]
     assert not any(step.terminated for step in steps[0])
 
@@ -384,15 +397,15 @@ def test_every_run_goes_its_own_way():
         observation, reward, _, _, info = env.step(actions[number])
         np.testing.assert_array_equal(observation, steps[1][number].next_observation)
         assert (reward, info["success"]) == (steps[1][number].reward, steps[1][number].success)
-    assert not np.array_equal(steps[1][13].next_observation, together.observations[1])
+    assert not np.array_equal(steps[1][13].next_observation, places[1].observation)
 
 
 def test_meta_world_is_stepped_with_float32_actions():
-    together = Environments(lambda: envs.make("door-lock"), [2], EVALUATION)
-    together.reset_all()
+    place = Local(lambda: envs.make("door-lock"), 2, EVALUATION)
+    place.begin(0)
     actions = wandering(60, 4, seed=6)
-    steps = [taken(together.step(0, action)) for action in actions]
-    together.close()
+    steps = [taken(go(place, action)) for action in actions]
+    place.close()
     observations, rewards, successes = lived(ours("door-lock"), episode_seed(2, EVALUATION, 0), actions)
     np.testing.assert_array_equal([step.observation for step in steps], observations[:-1].astype(np.float32))
     np.testing.assert_array_equal([step.next_observation for step in steps], observations[1:].astype(np.float32))
@@ -401,43 +414,39 @@ def test_meta_world_is_stepped_with_float32_actions():
 
 
 def test_the_last_observation_is_the_episodes_own():
-    together = Environments(lambda: point.make(3), [0], TRAINING)
-    together.reset_all()
-    steps = [taken(together.step(0, np.ones(2, np.float32))) for _ in range(4)]
+    place = Local(lambda: point.make(3), 0, TRAINING)
+    place.begin(0)
+    steps = [taken(go(place, np.ones(2, np.float32))) for _ in range(4)]
     np.testing.assert_allclose(steps[2].next_observation[:2] - steps[2].observation[:2], 0.1, atol=1e-6)
     assert np.abs(steps[3].observation[:2]).max() <= 0.1  # the next episode starts in the middle
     assert np.abs(steps[2].next_observation[:2]).max() > 0.15
 
 
 def test_termination_and_time_limit_are_told_apart():
-    def built() -> tuple[gymnasium.Env, EnvSpec]:
-        env, spec = custom.make(f"{HERE}:Lift", slice(0, 3), None, 4)  # has no limit of its own
-        return env, spec
-
-    together = Environments(built, [0], TRAINING)
-    together.reset_all()
-    steps = [taken(together.step(0, np.zeros(3, np.float32))) for _ in range(9)]
+    place = Local(lambda: custom.make(f"{HERE}:Lift", slice(0, 3), None, 4), 0, TRAINING)  # has no limit of its own
+    place.begin(0)
+    steps = [taken(go(place, np.zeros(3, np.float32))) for _ in range(9)]
     assert [step.truncated for step in steps] == [False, False, False, True] * 2 + [False]
     assert {step.success for step in steps} == {1.0}
 
-    early = Environments(lambda: point.make(terminate_at_goal=True, tell_success=False), [0], TRAINING)
-    early.reset_all()
-    step = taken(early.step(0, np.zeros(2, np.float32)))
+    early = Local(lambda: point.make(terminate_at_goal=True, tell_success=False), 0, TRAINING)
+    early.begin(0)
+    step = taken(go(early, np.zeros(2, np.float32)))
     while not step.ended:
-        step = taken(early.step(0, 5 * early.observations[0][2:]))
+        step = taken(go(early, 5 * early.observation[2:]))
     assert (step.terminated, step.truncated, step.success) == (True, False, None)
-    assert early.episodes == [1]
+    assert early.episode == 1
 
 
 def test_purposes_and_episodes_can_be_chosen():
-    training = Environments(point.make, [0, 0], TRAINING)
-    evaluation = Environments(point.make, [0, 0], EVALUATION)
-    evaluation.episodes = [0, 7]
-    training.reset_all()
-    evaluation.reset_all()
-    assert np.array_equal(*training.observations)
-    assert not np.array_equal(*evaluation.observations)
-    assert not np.array_equal(training.observations[0], evaluation.observations[0])
+    def first(purpose: int, episode: int) -> np.ndarray:
+        place = Local(point.make, 0, purpose)
+        place.begin(episode)
+        return place.observation
+
+    assert np.array_equal(first(TRAINING, 0), first(TRAINING, 0))
+    assert not np.array_equal(first(EVALUATION, 0), first(EVALUATION, 7))
+    assert not np.array_equal(first(TRAINING, 0), first(EVALUATION, 0))
 
 
 @pytest.mark.parametrize(
@@ -447,17 +456,16 @@ def test_purposes_and_episodes_can_be_chosen():
 )
 def test_restore_continues_bit_for_bit(make, steps: int, size: int):
     actions = wandering(steps + 20, size, seed=4)
-    together = Environments(make, [0, 9], TRAINING)
-    together.episodes = [0, 3]
-    together.reset_all()
-    original = [taken(together.step(1, action)) for action in actions]
+    place = Local(make, 9, TRAINING)
+    place.begin(3)
+    original = [taken(go(place, action)) for action in actions]
 
-    again = together.restore(1, 3, actions[:steps])
+    again = restore(place, 3, actions[:steps])
     assert isinstance(again, list)
     assert same(again, original[:steps])
-    assert (together.episodes[1], together.elapsed[1]) == (3, steps)
-    assert same([taken(together.step(1, action)) for action in actions[steps:]], original[steps:])
-    together.close()
+    assert (place.episode, place.elapsed) == (3, steps)
+    assert same([taken(go(place, action)) for action in actions[steps:]], original[steps:])
+    place.close()
 
 
 class Faulty(point.Point):
@@ -505,30 +513,23 @@ class Faulty(point.Point):
     ],
 )
 def test_a_broken_environment_is_told_and_left_alone(fault: str, message: str):
-    kinds = iter((fault, "none", "none"))
-
-    def built() -> tuple[gymnasium.Env, EnvSpec]:
-        return Faulty(next(kinds)), point.make(horizon=2)[1]
-
-    together = Environments(built, [0, 1], TRAINING)
-    together.reset_all()
+    kinds = iter((fault, "none"))
+    place = Local(lambda: (Faulty(next(kinds)), point.make(horizon=2)[1]), 0, TRAINING)
+    place.begin(0)
     action = np.ones(2, np.float32)
-    first = taken(together.step(0, action))
-    failure = together.step(0, action)
+    first = taken(go(place, action))
+    failure = go(place, action)
     assert isinstance(failure, Failure)
     with pytest.raises(AssertionError, match=message):
         taken(failure)
     assert "\n" not in failure.message
     assert "seed 0" in failure.message
-    broken: Any = together.envs[0]
+    broken: Any = place.env
     assert broken.calls == 2
-    assert together.step(0, action) == failure
+    assert go(place, action) == failure
     assert broken.calls == 2
-    assert together.failures == [failure, None]
-    assert isinstance(together.step(1, action), Step)
 
-    again = together.restore(0, 0, np.stack([action]))
+    again = restore(place, 0, np.stack([action]))
     assert isinstance(again, list)
     assert same(again, [first])
-    assert together.failures == [None, None]
-    assert isinstance(together.step(0, action), Step)
+    assert isinstance(go(place, action), Step)

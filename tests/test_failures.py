@@ -11,8 +11,8 @@ import pytest
 
 from senior.checkpoint import steps, unpack
 from senior.config import Config
+from senior.envs.episodes import AFTERWARDS, EVALUATION, TRAINING, episode_seed
 from senior.envs.point import Point
-from senior.envs.vector import AFTERWARDS, EVALUATION, TRAINING, episode_seed
 from senior.program import Quiet, Result, evaluate_run, resume, train
 from senior.types import BadInput
 from tests.equal import assert_same_run, progress_of

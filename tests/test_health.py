@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from senior import health, loop
-from senior.program import Quiet, make_learner
+from senior.program import Quiet, make_learner, spec_of
 from senior.runs import Runs
 from senior.trainee import Trainee
 from tests.small import small
@@ -88,7 +88,7 @@ def two_runs(path: Path) -> tuple[loop.Training, Said]:
     """Two runs that have just begun, with no state on the device, for what needs none."""
     said, config = Said(), small()
     learner = make_learner(config)
-    trainees = [Trainee(small(seed=seed), path / f"seed-{seed}", learner) for seed in (0, 1)]
+    trainees = [Trainee(small(seed=seed), path / f"seed-{seed}", learner, spec_of(config)) for seed in (0, 1)]
     for trainee in trainees:
         trainee.directory.create(trainee.config, {})
     return loop.Training(trainees, Runs([], "loop"), said), said

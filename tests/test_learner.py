@@ -18,7 +18,7 @@ from senior.agent.sac import Agent
 from senior.learner import Learner, Run
 from senior.methods import METHODS
 from senior.preferences import Preferences
-from senior.program import Quiet, make_learner, train
+from senior.program import Quiet, make_learner, spec_of, train
 from senior.replay import Fact
 from senior.reward.bilevel import FirstSteps
 from senior.reward.model import Labelled, rewards
@@ -71,7 +71,7 @@ def after(function: Any, run: Run, *arguments: Any) -> tuple[Run, Any]:
 @pytest.fixture(scope="module")
 def lived() -> Run:
     """A run of M-SENIOR in pre-training, with 150 facts and three updates behind it."""
-    runs = Runs([LEARNER.init(3)], "loop")
+    runs = Runs([LEARNER.init(replace(CONFIG, seed=3))], "loop")
     for i in range(FACTS):
         runs.one(0, LEARNER.store_pretraining, fact(i))
     for step in range(UPDATES):
@@ -223,8 +223,9 @@ def test_plain_sac_learns_from_the_true_reward_and_the_others_from_the_learned_o
     learner, run = LEARNER, curious
     if method == "sac":
         pretraining = replace(CONFIG.pretraining, until=0)
-        learner = make_learner(replace(CONFIG, method=METHODS[method], pretraining=pretraining))
-        run = learner.init(3)._replace(replay=curious.replay)
+        config = replace(CONFIG, method=METHODS[method], pretraining=pretraining)
+        learner = make_learner(config)
+        run = learner.init(config)._replace(replay=curious.replay)
 
     def learned(run: Run) -> Agent:
         return after(learner.learn, run, np.int32(500), np.int32(0))[0].agent
@@ -320,8 +321,9 @@ def test_the_length_scale_is_ten_times_the_spread_of_the_positions_that_are_stor
 
 def test_every_fit_standardises_by_what_is_stored_and_scores_replay_and_curiosity_buffer_so(curious: Run):
     """Once with 150 facts, and once more with 30 others."""
-    learner = make_learner(replace(CONFIG, reward=replace(CONFIG.reward, standardise=True)))
-    new = learner.init(3)
+    config = replace(CONFIG, reward=replace(CONFIG.reward, standardise=True))
+    learner = make_learner(config)
+    new = learner.init(config)
     assert new.model and new.model.scaling is not None
     rng, capacity = np.random.default_rng(0), CONFIG.queries.budget
     labelled = Labelled(
@@ -354,7 +356,7 @@ def test_every_fit_standardises_by_what_is_stored_and_scores_replay_and_curiosit
 
 def test_the_pairs_are_the_latest_that_were_labelled_and_padded_without_weight(tmp_path: Path):
     rng = np.random.default_rng(4)
-    trainee = Trainee(CONFIG, tmp_path, LEARNER)
+    trainee = Trainee(CONFIG, tmp_path, LEARNER, spec_of(CONFIG))
     observation = rng.normal(size=(16, 2, SEGMENT, 4)).astype(np.float32)
     action = rng.uniform(-1, 1, (16, 2, SEGMENT, 2)).astype(np.float32)
     said = [0, None, -1, 1, 1, 0, None, 1, 0, -1, 1, 0, None, 1, 0, 1]
@@ -466,9 +468,9 @@ def test_skipped_pairs_are_spent_and_nothing_is_learned_before_the_first_label(t
         assert bool(row["fit_epochs"]) == bool(row["outer_loss"]) == (step > 450), step
 
     learner = make_learner(config)
-    new = learner.init(config.seed)
+    new = learner.init(config)
     (unlabelled, _), (fitted, _) = (
-        checkpoint.restore(result.path / "checkpoints", step, learner.init(config.seed)) for step in (450, 551)
+        checkpoint.restore(result.path / "checkpoints", step, learner.init(config)) for step in (450, 551)
     )
     assert same(unlabelled.model, new.model)
     assert unlabelled.model is not None and fitted.model is not None

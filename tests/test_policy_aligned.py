@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from senior import replay
-from senior.program import make_learner
+from senior.program import make_learner, spec_of
 from senior.reward.model import Snippets, window_sums
 from senior.trainee import Trainee
 from senior.types import Source
@@ -36,7 +36,7 @@ def test_the_latest_rows_are_the_latest_wherever_the_ring_stands(facts: int, win
 def test_half_a_batch_is_recent_while_there_is_budget():
     config = small("qpa")
     learner = make_learner(config)
-    run = learner.init(0)
+    run = learner.init(config)
     run = run._replace(replay=run.replay._replace(count=jnp.int32(1500)))
     draw = jax.jit(learner._draw)
     mixed, plain = (draw(run, jax.random.key(1), jnp.int32(window)) for window in (200, 0))
@@ -49,7 +49,7 @@ def test_half_a_batch_is_recent_while_there_is_budget():
 
 def test_the_window_is_the_latest_episodes_long_and_closes_with_the_budget(tmp_path: Path):
     config = replace(small("qpa"), qpa=replace(small("qpa").qpa, episodes=3))
-    trainee = Trainee(config, tmp_path, make_learner(config))
+    trainee = Trainee(config, tmp_path, make_learner(config), spec_of(config))
     progress = trainee.progress
     try:
         for episode, rows in ((0, 0), (1, 50), (2, 100), (3, 150), (40, 150)):
@@ -63,7 +63,7 @@ def test_the_window_is_the_latest_episodes_long_and_closes_with_the_budget(tmp_p
         trainee.close()
     for method in ("m-senior", "pebble"):
         other = small(method)
-        trainee = Trainee(other, tmp_path, make_learner(other))
+        trainee = Trainee(other, tmp_path, make_learner(other), spec_of(other))
         trainee.progress.episode = 9
         assert trainee.recent_rows() == 0
         trainee.close()
@@ -72,7 +72,7 @@ def test_the_window_is_the_latest_episodes_long_and_closes_with_the_budget(tmp_p
 def test_candidates_come_from_its_own_episodes_alone(tmp_path: Path):
     config = replace(small("qpa"), qpa=replace(small("qpa").qpa, episodes=3))
     assert config.window == 3
-    trainee = Trainee(config, tmp_path, make_learner(config))
+    trainee = Trainee(config, tmp_path, make_learner(config), spec_of(config))
     try:
         trainee.progress.recent = [[number, 50 * number, 50] for number in range(5, 8)]
         found = trainee.candidate_starts(400)

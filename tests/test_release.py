@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from senior import parts
 from senior.agent import sac
 from senior.checks import check
 from senior.config import SAC
@@ -19,7 +18,7 @@ from senior.learner import Learner, Purpose, Run
 from senior.methods import METHODS
 from senior.preferences import Preferences
 from senior.presets import release
-from senior.program import make_environment
+from senior.program import make_learner
 from senior.replay import Fact
 from senior.reward import bilevel
 from senior.reward.bilevel import FirstSteps
@@ -31,14 +30,14 @@ from tests.test_select import mds, strokes
 FACTS, AT = 300, 10_000
 
 
+RELEASE = release(small())
+RELEASE = replace(RELEASE, sac=SAC(batch=512), steps=20_000, pge=replace(RELEASE.pge, decay=0.01))
+"""Batches of the paper's size, small networks."""
+
+
 @cache
 def learner() -> Learner:
-    """Batches of the paper's size, small networks."""
-    config = release(small())
-    config = replace(config, sac=SAC(batch=512), steps=20_000, pge=replace(config.pge, decay=0.01))
-    environment, spec = make_environment(config)
-    environment.close()
-    return Learner(config, spec, parts.bonus(config, spec))
+    return make_learner(RELEASE)
 
 
 @cache
@@ -46,7 +45,7 @@ def refreshed() -> Run:
     """A run of 300 facts, refreshed at step 10,000, and then of 30 more."""
     rng, tutor = np.random.default_rng(0), learner()
     store = jax.jit(tutor.store)
-    run = tutor.init(0)
+    run = tutor.init(RELEASE)
 
     def live(run: Run, first: int, last: int) -> Run:
         for i in range(first, last):

@@ -13,7 +13,7 @@ import pytest
 from senior import parts, replay
 from senior.config import Config, Networks, Pretraining, Queries
 from senior.envs import point
-from senior.envs.vector import Step
+from senior.envs.episodes import Step
 from senior.learner import Learner
 from senior.replay import Fact
 from senior.trainee import Trainee
@@ -165,7 +165,7 @@ def trainee_in(path: Path, capacity: int | None = None, per_session: int = 40) -
         pretraining=Pretraining(10, 30, 5),
     )
     spec = point.make()[1]
-    return Trainee(config, path, Learner(config, spec, parts.bonus(config, spec)))
+    return Trainee(config, path, Learner(config, spec, parts.bonus(config, spec)), spec)
 
 
 def episodes_of(lengths: list[int]) -> list[list[int]]:

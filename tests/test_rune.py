@@ -48,7 +48,7 @@ def test_the_bonus_is_the_deviation_times_a_weight_that_decays_with_the_environm
 @pytest.fixture(scope="module")
 def lived() -> Run:
     """A run with facts, scored by its model."""
-    run, rng = LEARNER.init(0), np.random.default_rng(0)
+    run, rng = LEARNER.init(CONFIG), np.random.default_rng(0)
     store = jax.jit(LEARNER.store)
     for i in range(60):
         vector = [rng.normal(size=n).astype(np.float32) for n in (4, 2, 4)]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from senior.loop import Watcher
     from senior.methods import METHODS, Method
     from senior.presets import preset, release, with_budget
-    from senior.program import Judgement, Quiet, Result, evaluate_run, resume, train
+    from senior.program import Judgement, Quiet, Result, evaluate_run, resume, train, train_all
     from senior.schedule import plan
     from senior.select import Context, Selection
     from senior.types import Answers, BadInput, EnvSpec, Pairs, Query
@@ -43,6 +43,7 @@ _HOME = {
     "release": "presets",
     "resume": "program",
     "train": "program",
+    "train_all": "program",
     "with_budget": "presets",
 }
 
@@ -67,6 +68,7 @@ __all__ = [
     "release",
     "resume",
     "train",
+    "train_all",
     "with_budget",
 ]
 

@@ -115,8 +115,8 @@ def measure(config: Config, runs: int, device: str, length: int, out: Path) -> d
     learns = config.method.learns_reward
     start = max(config.pretraining.until, config.pretraining.random_steps) + WARM_UP
     began = time.perf_counter()
-    learner = program.make_learner(config)
-    trainees = [Trainee(replace(config, seed=i), out / f"seed-{i}", learner) for i in range(runs)]
+    learner, spec = program.make_learner(config), program.spec_of(config)
+    trainees = [Trainee(replace(config, seed=i), out / f"seed-{i}", learner, spec) for i in range(runs)]
     for trainee in trainees:
         trainee.reset(0)
         trainee.directory.create(trainee.config, {})
@@ -188,7 +188,7 @@ def run(method: str, preset_name: str, task: str, steps: int, runs: int, device:
     names = list(METHODS) if method == "all" else [method]
     configs = [preset(preset_name, task, name) for name in names]
     device = prepare_device(device)
-    spec = program.make_learner(configs[0]).spec
+    spec = program.spec_of(configs[0])
     machine = {key: rundir.protocol(spec, device)[key] for key in ("device", "threads", "machine", "packages")}
     print(
         f"{machine['device']}, {machine['threads']} threads, {machine['machine']}; {task}, {preset_name}, {runs} run(s)"

@@ -6,10 +6,10 @@ import argparse
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from tqdm import tqdm
@@ -23,12 +23,27 @@ DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 
 @dataclass(frozen=True)
+class Machine:
+    """How the runs of a command share this machine; what they learn does not depend on it."""
+
+    workers: int | Literal["auto"] = "auto"
+    """Processes that the environments live in; 0: this one. auto: 0 on a CPU, one per processor on a GPU."""
+    runs_per_device: int | Literal["auto"] = "auto"
+    """How many runs are trained at a time, the others after them. auto: as many as the memory holds."""
+
+    def arguments(self) -> dict[str, Any]:
+        """As `senior.program` takes them."""
+        return {name: None if value == "auto" else value for name, value in asdict(self).items()}
+
+
+@dataclass(frozen=True)
 class TrainOptions:
     """Train one run, or several in one program; each gets a directory of its own."""
 
     config: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     seeds: int | None = None
     """How many runs: seeds --seed, --seed + 1, ... in one program. Left out: one."""
+    machine: Annotated[Machine, tyro.conf.arg(name="")] = field(default_factory=Machine)
     out: Path | None = None
     """Directory that takes seed-0/ and so on. Left out: runs/TASK-METHOD-PRESET."""
 
@@ -39,6 +54,7 @@ class ResumeOptions:
 
     run: tyro.conf.Positional[Path]
     """A run directory, or one that holds some."""
+    machine: Annotated[Machine, tyro.conf.arg(name="")] = field(default_factory=Machine)
 
 
 @dataclass(frozen=True)
@@ -169,7 +185,8 @@ def _train(arguments: list[str]) -> int:
     out = options.out or Path("runs") / f"{name}-{config.method.name}-{config.preset}"
     display = Display()
     try:
-        results = program.train(config, out, 1 if options.seeds is None else options.seeds, display)
+        seeds = 1 if options.seeds is None else options.seeds
+        results = program.train(config, out, seeds, display, **options.machine.arguments())
     finally:
         display.close()
     return _report(results, display)
@@ -181,7 +198,7 @@ def _resume(arguments: list[str]) -> int:
 
     display = Display()
     try:
-        results = program.resume(options.run, display)
+        results = program.resume(options.run, display, **options.machine.arguments())
     finally:
         display.close()
     return _report(results, display)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from senior.envs.vector import Environments, Failure
+from senior.envs.episodes import Episodes, Failure
 
-Policy = Callable[[np.ndarray], np.ndarray]
-"""observation [o] float32 -> action [a] in [-1, 1]."""
-
-
-class EpisodeFailed(Exception):
-    """The environment broke during an evaluation; the text says how."""
+Policies = Callable[[Mapping[int, np.ndarray]], Mapping[int, np.ndarray]]
+"""Per run: observation [o] float32 -> action [a] in [-1, 1]."""
 
 
 class Episode(NamedTuple):
@@ -25,27 +21,56 @@ class Episode(NamedTuple):
     actions: np.ndarray  # [T, a] float32
 
 
-def judge(policy: Policy, environment: Environments, episodes: Sequence[int]) -> list[Episode]:
-    """Run the policy through the given episodes of run 0 of ``environment``."""
-    judged = []
-    for number in episodes:
-        failed = environment.begin(0, number)
-        if failed:
-            raise EpisodeFailed(failed.message)
-        total, success, actions = 0.0, None, []
-        while True:
-            action = policy(environment.observations[0])
-            step = environment.step(0, action)
-            if isinstance(step, Failure):
-                raise EpisodeFailed(step.message)
-            actions.append(action)
-            total += step.reward
-            if step.success is not None:
-                success = max(success or 0.0, step.success)
-            if step.terminated or step.truncated:
-                break
-        judged.append(Episode(total, success, np.stack(actions)))
-    return judged
+class _Judging:
+    """One run, on its way through its episodes."""
+
+    def __init__(self, place: Episodes, episodes: Sequence[int]) -> None:
+        self.place = place
+        self.left = list(episodes)
+        self.judged: list[Episode] = []
+        self.failure: Failure | None = None
+        self._begin()
+
+    @property
+    def going_on(self) -> bool:
+        return self.failure is None and bool(self.left)
+
+    def _begin(self) -> None:
+        self.total, self.success, self.actions = 0.0, None, []
+        if self.left:
+            self.failure = self.place.begin(self.left[0])
+
+    def receive(self, action: np.ndarray) -> None:
+        """Count what ``action``, sent before, did."""
+        step = self.place.receive()
+        if isinstance(step, Failure):
+            self.failure = step
+            return
+        self.actions.append(action)
+        self.total += step.reward
+        if step.success is not None:
+            self.success = max(self.success or 0.0, step.success)
+        if step.ended:
+            self.judged.append(Episode(self.total, self.success, np.stack(self.actions)))
+            del self.left[0]
+            self._begin()
+
+
+def judge(
+    policies: Policies, places: Mapping[int, Episodes], episodes: Mapping[int, Sequence[int]]
+) -> dict[int, list[Episode] | Failure]:
+    """Bring every run's policy through its ``episodes`` in its place, all runs side by side.
+
+    Per run its judged episodes, or what broke its environment.
+    """
+    runs = {i: _Judging(place, episodes[i]) for i, place in places.items()}
+    while going_on := {i: run for i, run in runs.items() if run.going_on}:
+        actions = policies({i: run.place.observation for i, run in going_on.items()})
+        for i, run in going_on.items():
+            run.place.send(actions[i])
+        for i, run in going_on.items():
+            run.receive(actions[i])
+    return {i: run.failure or run.judged for i, run in runs.items()}
 
 
 def summary(episodes: Sequence[Episode]) -> dict[str, float | int | None]:

@@ -7,6 +7,7 @@ Every function takes the state of one run first and returns ``(state, result)``;
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -69,7 +70,8 @@ class Run(NamedTuple):
     learned_return: Float[Array, ""]  # learned reward summed over the running episode
 
 
-def _numbers(config: Config) -> Numbers:
+def numbers_of(config: Config) -> Numbers:
+    """The traced numbers of a configuration."""
     values = Numbers(
         sac.Numbers(
             config.sac.actor_rate,
@@ -88,35 +90,66 @@ def _numbers(config: Config) -> Numbers:
     return jax.tree.map(jnp.asarray, values)
 
 
+def shape(config: Config) -> Config:
+    """What of a configuration the traced functions are made from: runs that agree in it can share one program.
+
+    The rest, here at its defaults, is in `Numbers`, or the host's matter: seed, task, schedule, questions, teacher.
+    """
+    plain, method, reward = Config(), config.method, Config().reward
+    kept = replace(method, name="", select="uniform" if method.learns_reward else "none", outer="none")
+    return Config(
+        method=kept,
+        steps=config.capacity,
+        queries=replace(plain.queries, segment=config.queries.segment),
+        pretraining=config.pretraining,
+        networks=config.networks,
+        sac=replace(
+            plain.sac,
+            batch=config.sac.batch,
+            target_every=config.sac.target_every,
+            updates=config.sac.updates,
+            reset_updates=config.sac.reset_updates,
+        ),
+        reward=replace(config.reward, rate=reward.rate, epochs=reward.epochs, stop_accuracy=reward.stop_accuracy),
+        pge=replace(config.pge, every=plain.pge.every, equal=plain.pge.equal, refresh_with_outer=True),
+        bilevel=replace(plain.bilevel, optimizer=config.bilevel.optimizer, batch=config.bilevel.batch),
+        rune=config.rune,
+        qpa=replace(plain.qpa, share=config.qpa.share),
+        device=config.device,
+        precision=config.precision,
+    )
+
+
 class Learner:
-    """The functions of one run for one configuration of shapes and method cells. Holds no state."""
+    """The functions of one run, for all configurations of one `shape`. Holds no state."""
 
     def __init__(self, config: Config, spec: EnvSpec, bonus: Bonus) -> None:
-        self.config = config
+        self.config = shape(config)
         self.spec = spec
         self.bonus = bonus
         self.critic = normalised_relu if config.networks.layer_norm else jax.nn.relu
         self._compiled_init = jax.jit(self._init)
 
-    def init(self, seed: int) -> Run:
-        """The state before the first step."""
-        return self._compiled_init(np.uint32(seed))
+    def init(self, config: Config) -> Run:
+        """The state of a run of that configuration, which must have this shape, before its first step."""
+        assert shape(config) == self.config, "this configuration needs a learner of its own"
+        return self._compiled_init(np.uint32(config.seed), numbers_of(config), config.sac.initial_alpha)
 
-    def _init(self, seed: Int[Array, ""]) -> Run:
+    def _init(self, seed: Int[Array, ""], numbers: Numbers, initial_alpha: Float[Array, ""]) -> Run:
         config, spec, nets = self.config, self.spec, self.config.networks
         key_agent, key_model = jax.random.split(jax.random.fold_in(jax.random.key(seed), Purpose.INIT))
         until, neighbours = config.pretraining.until, config.pretraining.neighbours
         entropy, deviation = state_entropy.init(until, spec.observation_size, neighbours) if until else (None, None)
         return Run(
             seed=seed,
-            numbers=_numbers(config),
+            numbers=numbers,
             agent=sac.init(
                 key_agent,
                 spec.observation_size,
                 spec.action_size,
                 nets.layers,
                 nets.width,
-                config.sac.initial_alpha,
+                initial_alpha,
             ),
             model=self._new_model(key_model) if config.method.learns_reward else None,
             replay=replay_.init(config.capacity, spec.observation_size, spec.action_size),
@@ -340,8 +373,13 @@ def act(
     return jnp.where(random, uniform, action)
 
 
+def actor_of(run: Run) -> MLP:
+    """The part of a run that `mean_action` needs."""
+    return run.agent.actor
+
+
 def mean_action(actor: MLP, observation: Float[Array, " o"]) -> Float[Array, " a"]:
-    """The action that evaluation takes; ``actor`` is ``run.agent.actor``."""
+    """The action that evaluation takes."""
     return sac.mean_action(actor, observation)
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
@@ -19,9 +19,9 @@ import jax
 import numpy as np
 
 from senior import health, parts
-from senior.envs.vector import Failure, Step
-from senior.evaluate import EpisodeFailed, judge, summary
-from senior.learner import Purpose, act, acting, mean_action
+from senior.envs.episodes import Episodes, Failure, Step
+from senior.evaluate import judge, summary
+from senior.learner import Purpose, act, acting, actor_of, mean_action
 from senior.replay import Fact
 from senior.runs import PerRun, Proposal, Runs
 from senior.schedule import Due, due
@@ -77,15 +77,14 @@ class Clock:
 
 
 class Training:
-    """R runs that advance together."""
+    """R runs of one `senior.learner.shape` that advance together."""
 
     def __init__(self, trainees: Sequence[Trainee], runs: Runs, watcher: Watcher) -> None:
         self.trainees = list(trainees)
         self.runs = runs
         self.watcher = watcher
         self.clock = Clock(trainees[0].progress.step)
-        self.policy = jax.jit(mean_action)
-        self.last = trainees[0].config.steps
+        self.last = max(trainee.config.steps for trainee in trainees)
         self.waits = False  # wait for the device after each part, so that its time is that part's (senior bench)
 
     def train(self) -> None:
@@ -94,8 +93,7 @@ class Training:
         start = self.trainees[0].progress.step
         for step in range(start, last + 1):
             stop = self.watcher.stop
-            for i in self.active():
-                self.look_back(i, step, stop or step == last)
+            self.look_back(step, stop or step == last)
             if stop or step == last or not self.active():
                 return
 
@@ -105,7 +103,7 @@ class Training:
                     acting,
                     act,
                     self.mask(),
-                    [trainee.environment.observations[0] for trainee in self.trainees],
+                    [trainee.environment.observation for trainee in self.trainees],
                     [np.int32(step)] * len(plans),
                     [np.bool_(plan.random) for plan in plans],
                 )
@@ -134,11 +132,11 @@ class Training:
         self.runs.wait(update)
 
     def active(self) -> list[int]:
-        """Runs that have not failed."""
-        return [i for i, trainee in enumerate(self.trainees) if trainee.failure is None]
+        """Runs that go on: that have neither failed nor taken all their steps."""
+        return [i for i, trainee in enumerate(self.trainees) if trainee.goes_on]
 
     def mask(self) -> list[bool]:
-        return [trainee.failure is None for trainee in self.trainees]
+        return [trainee.goes_on for trainee in self.trainees]
 
     # Every step.
 
@@ -149,7 +147,10 @@ class Training:
             chosen = {i: np.asarray(actions[i]) for i in self.active()}
         with self.clock.part("environment"):
             for i, action in chosen.items():
-                result = self.trainees[i].environment.step(0, action)
+                self.trainees[i].environment.send(action)
+            for i in chosen:
+                result = self.trainees[i].environment.receive()
+                self.note(i, self.trainees[i].environment)
                 if isinstance(result, Failure):
                     self.fail(i, step, result.message)
                 else:
@@ -159,7 +160,7 @@ class Training:
     def update(self, step: int, plans: Sequence[Due]) -> Proposal | None:
         """What the update would make of every run, on state entropy in pre-training, on rewards afterwards.
 
-        All runs have one configuration, so what is due is due for all.
+        All runs have one shape, which says when updates begin and of what kind they are.
         """
         learner, steps = self.trainees[0].learner, [np.int32(step)] * len(plans)
         if plans[0].pretrain:
@@ -295,50 +296,58 @@ class Training:
 
     # Looking back: evaluation, snapshots, checkpoints.
 
-    def look_back(self, i: int, step: int, last: bool) -> None:
-        """What is due before the action of ``step``; ``last``: the run ends or is interrupted here."""
-        trainee = self.trainees[i]
-        config, progress = trainee.config, trainee.progress
-        at_end = step == config.steps
-        if step > progress.evaluated and (step % config.evaluation.every == 0 or at_end):
+    def look_back(self, step: int, last: bool) -> None:
+        """What is due before the action of ``step``; ``last``: all runs end or are interrupted here."""
+        judged = [
+            i
+            for i in self.active()
+            if step > self.trainees[i].progress.evaluated
+            and (step % self.trainees[i].config.evaluation.every == 0 or step == self.trainees[i].config.steps)
+        ]
+        if judged:
             with self.clock.part("evaluate"):
-                if not self.evaluate(i, step):
-                    return
-            trainee.directory.append("timing.csv", self.clock.row(step))
-        if step > progress.snapped and (step % config.snapshot_every == 0 or at_end):
-            self.snapshot(i, step)
-            progress.snapped = step
-        if step > progress.step and (step % config.checkpoint_every == 0 or last):
-            with self.clock.part("checkpoint"):
-                trainee.save(self.runs[i], step)
+                self.evaluate(judged, step)
+        for i in self.active():
+            trainee = self.trainees[i]
+            config, progress = trainee.config, trainee.progress
+            at_end = step == config.steps
+            if i in judged:
+                trainee.directory.append("timing.csv", self.clock.row(step))
+            if step > progress.snapped and (step % config.snapshot_every == 0 or at_end):
+                self.snapshot(i, step)
+                progress.snapped = step
+            if step > progress.step and (step % config.checkpoint_every == 0 or at_end or last):
+                with self.clock.part("checkpoint"):
+                    trainee.save(self.runs[i], step)
+            trainee.done = at_end
 
-    def evaluate(self, i: int, step: int) -> bool:
-        """Judge the policy on fresh episodes; False if the environment broke."""
-        trainee = self.trainees[i]
-        config, progress = trainee.config, trainee.progress
-        actor = self.runs.view(i, lambda run: run.agent.actor)
-        count = config.evaluation.episodes
-        first = -(-step // config.evaluation.every) * count
-        try:
-            episodes = judge(
-                lambda observation: np.asarray(self.policy(actor, observation)),
-                trainee.judged_in,
-                range(first, first + count),
+    def evaluate(self, judged: Sequence[int], step: int) -> None:
+        """Judge the policies of some runs on fresh episodes; one whose environment breaks is stopped."""
+        trainees = self.trainees
+
+        def policies(observations: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+            mask = [i in observations for i in range(len(trainees))]
+            seen = [observations.get(i, trainee.judged_in.observation) for i, trainee in enumerate(trainees)]
+            actions = self.runs.look(actor_of, mean_action, mask, seen)
+            return {i: np.asarray(actions[i]) for i in observations}
+
+        places = {i: trainees[i].judged_in for i in judged}
+        found = judge(policies, places, {i: trainees[i].evaluation_episodes(step) for i in judged})
+        for i, episodes in found.items():
+            self.note(i, places[i])
+            if isinstance(episodes, Failure):
+                self.fail(i, step, episodes.message)
+                continue
+            trainee, progress, result = trainees[i], trainees[i].progress, summary(episodes)
+            trainee.directory.append(
+                "eval.csv", {"step": step, "labels": progress.labels, "queried": progress.queried, **result}
             )
-        except EpisodeFailed as error:
-            self.fail(i, step, str(error))
-            return False
-        result = summary(episodes)
-        trainee.directory.append(
-            "eval.csv", {"step": step, "labels": progress.labels, "queried": progress.queried, **result}
-        )
-        progress.evaluated, progress.success = step, result["success_rate"]
-        if result["success_rate"] is not None and progress.learned_returns and progress.labels:
-            progress.evaluations.append([result["success_rate"], float(np.mean(progress.learned_returns))])
-            success, learned = zip(*progress.evaluations, strict=True)
-            self.warn(i, "fall", health.success_falls(success, learned))
-        progress.learned_returns.clear()
-        return True
+            progress.evaluated, progress.success = step, result["success_rate"]
+            if result["success_rate"] is not None and progress.learned_returns and progress.labels:
+                progress.evaluations.append([result["success_rate"], float(np.mean(progress.learned_returns))])
+                success, learned = zip(*progress.evaluations, strict=True)
+                self.warn(i, "fall", health.success_falls(success, learned))
+            progress.learned_returns.clear()
 
     def snapshot(self, i: int, step: int) -> None:
         """2,000 positions of the latest steps, and the samples behind f_P and f_E where there is PGE."""
@@ -366,6 +375,13 @@ class Training:
         trainee.progress.warned.append(kind)
         trainee.directory.warn(sentence)
         self.watcher.say(f"Warning ({trainee.name}): {sentence}")
+
+    def note(self, i: int, place: Episodes) -> None:
+        """Tell, and keep in the run directory, what went wrong with an environment and was put right."""
+        while place.notes:
+            sentence = place.notes.pop(0)
+            self.trainees[i].directory.note(sentence)
+            self.watcher.say(f"{self.trainees[i].name}: {sentence}")
 
     def fail(self, i: int, step: int, message: str) -> None:
         """Stop one run, with a checkpoint at the beginning of ``step``; the others go on."""

@@ -67,7 +67,7 @@ class Preferences:
         )
         self._shape = (segment, observation_size, action_size)
         try:
-            self._db = sqlite3.connect(path)
+            self._db = sqlite3.connect(path, check_same_thread=False)  # one thread after another uses it
             self._open(path)
         except sqlite3.Error as error:
             raise BadInput(f"{path} cannot be used: {error}.") from error

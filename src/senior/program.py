@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
+from threading import Lock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from senior import evaluate, parts, rundir
+from senior import checkpoint, evaluate, parts, rundir
 from senior.agent.networks import MLP
 from senior.checkpoint import Damaged, unpack
 from senior.checks import check
 from senior.config import Config, load
 from senior.envs import render
-from senior.envs.vector import AFTERWARDS, Environments, episode_seed
-from senior.learner import Learner, Run, mean_action
+from senior.envs.episodes import AFTERWARDS, Failure, episode_seed
+from senior.envs.workers import Workers
+from senior.learner import Learner, Run, mean_action, shape
 from senior.loop import Training, Watcher
 from senior.report.curves import learning_curve
-from senior.runs import Lift, Runs, lift_for, prepare_device
-from senior.trainee import Trainee, make_environment
+from senior.runs import Lift, Runs, device_memory, lift_for, prepare_device, state_bytes
+from senior.trainee import Trainee, make_environment, make_place
 from senior.types import BadInput, EnvSpec
 
 
@@ -61,103 +66,122 @@ def train(
     seeds: int = 1,
     watcher: Watcher | None = None,
     lift: Lift | None = None,
+    workers: int | None = None,
+    runs_per_device: int | None = None,
 ) -> list[Result]:
     """Train ``seeds`` runs (seeds ``config.seed``, +1, ...) in one program, each in ``out/seed-N``.
 
-    watcher: who is told of every step and of warnings, and can stop the runs, all saved; None prints warnings.
-    lift: how the runs share the program, ``loop`` or ``vmap``; None takes what suits the device.
-
-    Returns one `Result` per run. Raises `BadInput` before anything is written if the configuration makes no
-    sense, the environment does not fit, or a directory is not empty.
+    The other arguments, what comes back and what is raised: see `train_all`.
     """
     if seeds < 1:
         raise BadInput(f"--seeds must be at least 1, not {seeds}.")
-    check(config)
-    check(replace(config, seed=config.seed + seeds - 1))
+    configs = [replace(config, seed=config.seed + number) for number in range(seeds)]
+    runs = [(own, Path(out) / f"seed-{own.seed}") for own in configs]
+    return train_all(runs, watcher, lift, workers, runs_per_device)
+
+
+def train_all(
+    runs: Sequence[tuple[Config, Path]],
+    watcher: Watcher | None = None,
+    lift: Lift | None = None,
+    workers: int | None = None,
+    runs_per_device: int | None = None,
+) -> list[Result]:
+    """Train runs of any configurations, each in its directory, on one device.
+
+    Runs whose configurations have one `senior.learner.shape` share one program: they may differ in seed, task,
+    schedule, teacher and numbers. Programs of different shapes go side by side on a GPU, one after the other on a CPU.
+    A run's result does not depend on the runs beside it.
+
+    watcher: who is told of every step and of warnings, and can stop the runs, all saved; None prints warnings.
+    lift: how runs share a program, ``loop`` or ``vmap``; None takes what suits the device.
+    workers: processes that the environments live in; 0: this one; None: as many as there are processors on a GPU,
+        but not more than runs, and 0 on a CPU.
+    runs_per_device: how many are trained at a time; None: as many as the memory holds.
+
+    Returns one `Result` per run, in order. Raises `BadInput` before anything is written if a configuration makes no
+    sense, an environment does not fit, or a directory is not empty.
+    """
+    if not runs:
+        raise BadInput("There is no run to train.")
+    for config, _ in runs:
+        check(config)
+    if len({config.device for config, _ in runs}) > 1:
+        raise BadInput("All runs of a program are on one device, so their --device must be the same.")
+    if len({path.resolve() for _, path in runs}) < len(runs):
+        raise BadInput("Every run needs a directory of its own.")
     watcher = watcher or Quiet()
-    device = prepare_device(config.device)
-    config = replace(config, device=device, answering=parts.answering(config))
-    learner = make_learner(config)
-    if config.method.learns_reward and learner.spec.horizon <= config.queries.segment:
+    device = prepare_device(runs[0][0].device)
+    with _workers(workers, device, len(runs)) as pool:
+        trainees = []
+        for config, path in runs:
+            own = replace(config, device=device, answering=parts.answering(config))
+            learner, spec = make_learner(own), spec_of(own)
+            _check_fit(own, spec)
+            trainees.append(Trainee(own, path, learner, spec, pool.next() if pool else None))
+        for trainee in trainees:
+            trainee.directory.check_free()
+            trainee.reset(0)
+        for trainee in trainees:
+            trainee.directory.create(trainee.config, rundir.protocol(trainee.spec, device))
+        return _run([(trainee, trainee.begin) for trainee in trainees], watcher, lift, runs_per_device)
+
+
+def _check_fit(config: Config, spec: EnvSpec) -> None:
+    """Refuse what does not fit into an environment's episodes."""
+    if config.method.learns_reward and spec.horizon <= config.queries.segment:
         raise BadInput(
-            f"A segment of {config.queries.segment} steps does not fit into an episode of {learner.spec.horizon}; "
+            f"A segment of {config.queries.segment} steps does not fit into an episode of {spec.horizon}; "
             "lower --segment."
         )
-    if config.capacity < min(learner.spec.horizon, config.steps):
+    if config.capacity < min(spec.horizon, config.steps):
         raise BadInput(
-            f"A replay of {config.capacity} rows cannot hold an episode of {learner.spec.horizon} steps; raise "
+            f"A replay of {config.capacity} rows cannot hold an episode of {spec.horizon} steps; raise "
             "--replay-capacity."
         )
-    trainees = []
-    for number in range(seeds):
-        own = replace(config, seed=config.seed + number)
-        trainees.append(Trainee(own, Path(out) / f"seed-{own.seed}", learner))
-    for trainee in trainees:
-        trainee.directory.check_free()
-        trainee.reset(0)
-    protocol = rundir.protocol(learner.spec, device)
-    for trainee in trainees:
-        trainee.directory.create(trainee.config, protocol)
-    _announce(device, watcher)
-    runs = Runs([trainee.begin() for trainee in trainees], lift or lift_for(device))
-    return _run(trainees, runs, watcher)
 
 
-def resume(path: Path | str, watcher: Watcher | None = None) -> list[Result]:
+def resume(
+    path: Path | str,
+    watcher: Watcher | None = None,
+    workers: int | None = None,
+    runs_per_device: int | None = None,
+) -> list[Result]:
     """Continue an interrupted run, or every run under a directory that is not finished.
 
-    Runs that stand at the same step go on in one program. One that cannot go on is told, and the others do. Raises
-    `BadInput` if there is no run, or the only one cannot go on.
+    Runs of one shape that stand at the same step go on in one program. One that cannot go on is told, and the others
+    do. ``workers``, ``runs_per_device``: see `train_all`. Raises `BadInput` if there is no run, or the only one cannot
+    go on.
     """
     watcher = watcher or Quiet()
-    waiting: list[tuple[Trainee, Run]] = []
-    results: list[Result] = []
     found = find_runs(path)
-    for directory in found:
-        try:
-            waiting.append(_reopen(directory, watcher))
-        except BadInput as error:
-            if len(found) == 1:
-                raise
-            watcher.say(f"{directory}: {error}")
-            results.append(Result(directory, None, 0, False, str(error), 0, None))
-    if waiting:
-        _announce(waiting[0][0].config.device, watcher)
-    while waiting:
-        first = waiting[0][0]
-        together = [
-            pair
-            for pair in waiting
-            if pair[0].progress.step == first.progress.step
-            and replace(pair[0].config, seed=0) == replace(first.config, seed=0)
-        ]
-        waiting = [pair for pair in waiting if not any(pair is other for other in together)]
-        trainees = [trainee for trainee, _ in together]
-        for trainee in trainees:
-            trainee.learner = first.learner
-        runs = Runs([run for _, run in together], lift_for(first.config.device))
-        results += _run(trainees, runs, watcher)
-        if watcher.stop:
-            for trainee, _ in waiting:
-                trainee.close()
-            return results + [_finish(trainee) for trainee, _ in waiting]
-    return results
+    with ExitStack() as stack:
+        pool: Workers | None = None
+        waiting: list[tuple[Trainee, Callable[[], Run]]] = []
+        results: list[Result] = []
+        for directory in found:
+            try:
+                config = load(directory / "config.json")
+                device = prepare_device(config.device)
+                if not waiting:
+                    pool = stack.enter_context(_workers(workers, device, len(found)))
+                worker = pool.next() if pool else None
+                trainee = Trainee(config, directory, make_learner(config), spec_of(config), worker)
+                with rundir.told(directory):
+                    trainee.directory.lock()
+            except BadInput as error:
+                if len(found) == 1:
+                    raise
+                results.append(_unopened(directory, error, watcher))
+                continue
+            _compare_protocol(trainee, device, watcher)
+            waiting.append((trainee, partial(trainee.resume, watcher.say)))
+        return results + _run(waiting, watcher, None, runs_per_device, alone=len(found) == 1)
 
 
-def _announce(device: str, watcher: Watcher) -> None:
-    watcher.say(f"Training on the {device.upper()}, {rundir.threads()} threads.")
-
-
-def _reopen(directory: Path, watcher: Watcher) -> tuple[Trainee, Run]:
-    config = load(directory / "config.json")
-    device = prepare_device(config.device)
-    trainee = Trainee(config, directory, make_learner(config))
-    _compare_protocol(trainee, device, watcher)
-    try:
-        return trainee, trainee.resume(watcher.say)
-    except BadInput:
-        trainee.close()
-        raise
+def _unopened(directory: Path, error: BadInput, watcher: Watcher) -> Result:
+    watcher.say(f"{directory}: {error}")
+    return Result(directory, None, 0, False, str(error), 0, None)
 
 
 @dataclass(frozen=True)
@@ -192,15 +216,15 @@ def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None 
     prepare_device("auto")
     step, actor = load_policy(path)
     policy = jax.jit(mean_action)
-    environment = Environments(lambda: make_environment(config), [config.seed], AFTERWARDS)
+    place = make_place(config, AFTERWARDS)
     try:
-        judged = evaluate.judge(
-            lambda observation: np.asarray(policy(actor, observation)), environment, range(episodes)
-        )
-    except evaluate.EpisodeFailed as error:
-        raise BadInput(str(error)) from error
+        judged = evaluate.judge(lambda seen: {0: np.asarray(policy(actor, seen[0]))}, {0: place}, {0: range(episodes)})[
+            0
+        ]
     finally:
-        environment.close()
+        place.close()
+    if isinstance(judged, Failure):
+        raise BadInput(judged.message)
     summary = evaluate.summary(judged)
     reason = None
     if video is not None:
@@ -267,26 +291,134 @@ def find_runs(path: Path | str) -> list[Path]:
     return found
 
 
-def make_learner(config: Config) -> Learner:
-    """The functions of a run of that configuration; looks at its environment once."""
+def spec_of(config: Config) -> EnvSpec:
+    """What there is to know of a configuration's environment; looks at it once."""
     environment, spec = make_environment(config)
     environment.close()
-    return _learner(replace(config, seed=0), spec)
+    return spec
 
 
-@lru_cache(maxsize=16)
+def make_learner(config: Config) -> Learner:
+    """The functions of a run of that configuration."""
+    spec = spec_of(config)
+    if ":" not in config.method.explore:  # somebody's own bonus may look at all of it
+        spec = replace(spec, name="", horizon=0, tells_success=False)
+    return _learner(shape(config), spec)
+
+
+@lru_cache(maxsize=64)
 def _learner(config: Config, spec: EnvSpec) -> Learner:
-    """One learner for equal configurations, so that what one run compiled serves the next."""
+    """One learner for configurations of one shape, so that what one run compiled serves the next."""
     return Learner(config, spec, parts.bonus(config, spec))
 
 
-def _run(trainees: Sequence[Trainee], runs: Runs, watcher: Watcher) -> list[Result]:
+@contextmanager
+def _workers(count: int | None, device: str, runs: int) -> Iterator[Workers | None]:
+    """Processes for the environments of so many runs, until the end of the block; None: they live in this one."""
+    if count is None:
+        count = min(rundir.threads(), runs) if device == "gpu" else 0
+    if not 0 <= count <= 1024:
+        raise BadInput(f"--workers {count} must be between 0 and 1024.")
+    pool = Workers(count) if count else None
     try:
-        Training(trainees, runs, watcher).train()
-        return [_finish(trainee) for trainee in trainees]
+        yield pool
     finally:
-        for trainee in trainees:
+        if pool is not None:
+            pool.close()
+
+
+class _Together:
+    """One watcher for programs that run side by side."""
+
+    def __init__(self, watcher: Watcher) -> None:
+        self._watcher = watcher
+        self._lock = Lock()
+
+    @property
+    def stop(self) -> bool:
+        return self._watcher.stop
+
+    def advance(self, step: int, trainees: Sequence[Trainee]) -> None:
+        with self._lock:
+            self._watcher.advance(step, trainees)
+
+    def say(self, sentence: str) -> None:
+        with self._lock:
+            self._watcher.say(sentence)
+
+
+def _run(
+    waiting: Sequence[tuple[Trainee, Callable[[], Run]]],
+    watcher: Watcher,
+    lift: Lift | None,
+    runs_per_device: int | None,
+    alone: bool = False,
+) -> list[Result]:
+    """Train runs, each given with what opens its state, as many at a time as there is room for.
+
+    alone: one that cannot be opened ends it all, for there is no other.
+    """
+    results: dict[Path, Result] = {}
+    try:
+        left = list(waiting)
+        while left:
+            device = left[0][0].config.device
+            how = lift or lift_for(device)
+            together = _together([trainee for trainee, _ in left], device, how, runs_per_device, watcher)
+            batch, left = left[:together], left[together:]
+            programs: dict[tuple[int, int], list[tuple[Trainee, Run]]] = defaultdict(list)
+            for trainee, opened in batch:
+                try:
+                    run = opened()
+                except BadInput as error:
+                    if alone:
+                        raise
+                    results[trainee.directory.path] = _unopened(trainee.directory.path, error, watcher)
+                    continue
+                programs[id(trainee.learner), trainee.progress.step].append((trainee, run))
+            _train(list(programs.values()), _Together(watcher), how)
+            results |= {t.directory.path: _finish(t) for program in programs.values() for t, _ in program}
+            if watcher.stop:
+                break
+        for trainee, _ in left:
+            trainee.progress.step = next(iter(checkpoint.steps(trainee.directory.checkpoints)), 0)
+            results[trainee.directory.path] = _finish(trainee)
+    finally:
+        for trainee, _ in waiting:
             trainee.close()
+    return [results[trainee.directory.path] for trainee, _ in waiting]
+
+
+def _together(
+    trainees: Sequence[Trainee], device: str, lift: Lift, runs_per_device: int | None, watcher: Watcher
+) -> int:
+    """How many of the runs, from the first on, are trained at a time; tells what memory they take."""
+    if runs_per_device is not None and runs_per_device < 1:
+        raise BadInput(f"--runs-per-device {runs_per_device} must be at least 1.")
+    sizes = [state_bytes(trainee.learner, trainee.config) for trainee in trainees]
+    # under vmap states are there twice while they are put into one array
+    room = np.cumsum(sizes) * (2 if lift == "vmap" else 1) <= 0.9 * device_memory(device)
+    count = max(1, min(int(room.sum()), runs_per_device or len(trainees)))
+    told = f"Training on the {device.upper()}, {rundir.threads()} threads. A run keeps {max(sizes) / 1e9:.2g} GB"
+    if len(trainees) > 1:
+        told += f"; {count} of {len(trainees)} runs at a time, {sum(sizes[:count]) / 1e9:.2g} GB"
+    watcher.say(f"{told}.")
+    return count
+
+
+def _train(programs: Sequence[Sequence[tuple[Trainee, Run]]], watcher: Watcher, lift: Lift) -> None:
+    """Train several programs: one after the other, or, where the device would idle between, side by side."""
+
+    def train_one(program: Sequence[tuple[Trainee, Run]]) -> None:
+        Training([trainee for trainee, _ in program], Runs([run for _, run in program], lift), watcher).train()
+
+    if lift == "loop" or len(programs) < 2:
+        for program in programs:
+            train_one(program)
+        return
+    with ThreadPoolExecutor(len(programs)) as executor:
+        for done in [executor.submit(train_one, program) for program in programs]:
+            done.result()
 
 
 def _finish(trainee: Trainee) -> Result:

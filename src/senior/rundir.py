@@ -16,6 +16,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -140,6 +141,11 @@ class RunDirectory:
         """Keep a health warning."""
         with open(self.path / "warnings.log", "a") as file:
             file.write(sentence + "\n")
+
+    def note(self, sentence: str) -> None:
+        """Keep what befell this machine and not the run: a worker that was replaced."""
+        with open(self.path / "workers.log", "a") as file:
+            file.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {sentence}\n")
 
     def lengths(self) -> dict[str, int]:
         """Bytes in every append-only file, which are then on the disk."""

@@ -17,8 +17,10 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from senior.learner import Run
+from senior.config import Config
+from senior.learner import Learner, Run
 from senior.types import BadInput
 
 Lift = Literal["loop", "vmap"]
@@ -179,7 +181,10 @@ def _of_part(of_one: OfOneRun, changes: Sequence[str]) -> Callable[..., tuple[tu
 
 
 def _stack(trees: Sequence[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+    """One tree with a leading run axis. What is on the host is put together there, to go to the device at once."""
+    on_host = all(isinstance(leaf, (np.ndarray, np.generic)) for leaf in jax.tree.leaves(trees[0]))
+    stack = np.stack if on_host else jnp.stack
+    return jax.tree.map(lambda *leaves: stack(leaves), *trees)
 
 
 class _Stacked:
@@ -249,6 +254,19 @@ def _keep_memory() -> None:
             (-2, 2**26),
         ):  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_TOP_PAD
             mallopt(parameter, value)
+
+
+def state_bytes(learner: Learner, config: Config) -> int:
+    """Memory that the state of one run takes on the device, in bytes: nearly all of it is the replay."""
+    leaves = jax.tree.leaves(jax.eval_shape(lambda: learner.init(config)))
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)
+
+
+def device_memory(device: str) -> float:
+    """Bytes of memory there are: the machine's, or what XLA may take of the GPU's."""
+    if device == "gpu":
+        return float(jax.devices()[0].memory_stats()["bytes_limit"])
+    return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
 
 
 def lift_for(device: str) -> Lift:

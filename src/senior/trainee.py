@@ -11,7 +11,8 @@ import numpy as np
 
 from senior import checkpoint, envs, parts
 from senior.config import Config
-from senior.envs.vector import EVALUATION, TRAINING, Environments, Failure, Step
+from senior.envs.episodes import EVALUATION, TRAINING, Episodes, Failure, Local, Step, restore
+from senior.envs.workers import Remote, Worker
 from senior.learner import Learner, Purpose, Run
 from senior.preferences import Preferences
 from senior.reward.bilevel import FirstSteps
@@ -53,24 +54,44 @@ class Progress:
     warned: list[str] = field(default_factory=list)
 
 
-def make_environment(config: Config, render: bool = False) -> tuple[Any, EnvSpec]:
+def make_environment(config: Config) -> tuple[Any, EnvSpec]:
     """The environment of a configuration."""
-    task = None if config.env else config.task
-    return envs.make(task, config.env, config.position, config.length_scale, config.horizon, render)
+    return envs.make(**_made_by(config))
+
+
+def _made_by(config: Config) -> dict[str, Any]:
+    return {
+        "task": None if config.env else config.task,
+        "env": config.env,
+        "position": config.position,
+        "length_scale": config.length_scale,
+        "horizon": config.horizon,
+    }
+
+
+def make_place(config: Config, purpose: int, spec: EnvSpec | None = None, worker: Worker | None = None) -> Episodes:
+    """The environment of a configuration, for a purpose; with a ``worker``, which ``spec`` goes with, in that."""
+    if worker is not None and spec is not None:
+        return Remote(worker, _made_by(config), spec, config.seed, purpose)
+    return Local(lambda: make_environment(config), config.seed, purpose)
 
 
 class Trainee:
     """One run, as its host sees it. `begin` or `resume` gives it its state."""
 
-    def __init__(self, config: Config, path: Path, learner: Learner) -> None:
+    def __init__(
+        self, config: Config, path: Path, learner: Learner, spec: EnvSpec, worker: Worker | None = None
+    ) -> None:
+        """``spec``: of its environment. ``worker``: the process that its environments live in; None: this one."""
         self.config = config
-        self.spec = learner.spec
+        self.spec = spec
         self.learner = learner
         self.directory = RunDirectory(path)
         self.progress = Progress()
         self.failure: str | None = None
-        self.environment = Environments(lambda: make_environment(config), [config.seed], TRAINING)
-        self.judged_in = Environments(lambda: make_environment(config), [config.seed], EVALUATION)
+        self.done = False
+        self.environment = make_place(config, TRAINING, spec, worker)
+        self.judged_in = make_place(config, EVALUATION, spec, worker)
         self.rule = parts.selection(config) if config.method.learns_reward else None
         self.teacher = parts.teacher(config)
         self._preferences: Preferences | None = None
@@ -78,6 +99,11 @@ class Trainee:
     @property
     def name(self) -> str:
         return f"seed {self.config.seed}"
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether it has neither failed nor taken all its steps."""
+        return self.failure is None and not self.done
 
     @property
     def preferences(self) -> Preferences:
@@ -103,25 +129,24 @@ class Trainee:
         """A new run in a directory made for it, whose environment stands at its first step (`reset`)."""
         self.directory.forget_everything()
         self._open_preferences(0)
-        return self.learner.init(self.config.seed)
+        return self.learner.init(self.config)
 
     def reset(self, episode: int) -> None:
         """Bring the environment to the beginning of an episode; `BadInput` if it cannot."""
-        failed = self.environment.begin(0, episode)
+        failed = self.environment.begin(episode)
         if failed:
             raise BadInput(failed.message)
 
     def resume(self, tell: Callable[[str], None]) -> Run:
         """The newest checkpoint that can be read, or the beginning if there is none yet.
 
-        Raises `BadInput` if another process trains this run, or its directory cannot be used.
+        Raises `BadInput` if its directory cannot be used. Whoever calls this holds the directory's lock.
         """
         with told(self.directory.path):
-            self.directory.lock()
             return self._resume(tell)
 
     def _resume(self, tell: Callable[[str], None]) -> Run:
-        found = checkpoint.newest(self.directory.checkpoints, lambda: self.learner.init(self.config.seed), tell)
+        found = checkpoint.newest(self.directory.checkpoints, lambda: self.learner.init(self.config), tell)
         if found is None:
             if any(self.directory.checkpoints.glob("step-*.npz")):
                 raise BadInput(f"No checkpoint in {self.directory.path} can be read; the run cannot be resumed.")
@@ -153,7 +178,7 @@ class Trainee:
             episode, first, length = latest[0]
             rows = np.arange(first, first + length)
         rows = rows % run.replay.capacity
-        steps = self.environment.restore(0, episode, np.asarray(run.replay.facts.action)[rows])
+        steps = restore(self.environment, episode, np.asarray(run.replay.facts.action)[rows])
         if isinstance(steps, Failure):
             raise BadInput(f"The run cannot go on: {steps.message}")
         stored = np.asarray(run.replay.facts.next_observation)[rows]
@@ -245,6 +270,12 @@ class Trainee:
         drawn = rng.integers(len(usable), size=shape)
         start = rng.integers(length[drawn] - queries.segment)
         return (first[drawn] + start).astype(np.int32), episode[drawn], start
+
+    def evaluation_episodes(self, step: int) -> range:
+        """Numbers of the episodes of the evaluation at ``step``; no two evaluations share one."""
+        every, count = self.config.evaluation.every, self.config.evaluation.episodes
+        first = -(-step // every) * count
+        return range(first, first + count)
 
     def recent_rows(self) -> int:
         """How many of the latest rows QPA draws a share of each batch from; 0: none, or not any more.

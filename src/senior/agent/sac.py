@@ -42,7 +42,9 @@ class Numbers(NamedTuple):
     target_entropy: Float[Array, ""] | float  # per action dimension
 
 
-def init(key: PRNGKeyArray, observation_size: int, action_size: int, layers: int, width: int, alpha: float) -> Agent:
+def init(
+    key: PRNGKeyArray, observation_size: int, action_size: int, layers: int, width: int, alpha: Array | float
+) -> Agent:
     """A new agent; ``alpha`` is the first temperature."""
     key_actor, key_critics = jax.random.split(key)
     actor = init_mlp(key_actor, observation_size, layers, width, 2 * action_size, orthogonal)

@@ -14,8 +14,8 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-import mujoco
 import numpy as np
+from mujoco import MjData, MjSpec, mj_forward, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 from scipy.spatial.transform import Rotation
 
 READS_VISUAL_GEOMS = ("door-open", "door-close")
@@ -32,10 +32,10 @@ def lean(task: str, stock: Any) -> Any:
         def _initialize_simulation(self) -> tuple[Any, Any]:
             if task in READS_VISUAL_GEOMS:
                 return super()._initialize_simulation()
-            spec = mujoco.MjSpec.from_file(self.fullpath)
+            spec = MjSpec.from_file(self.fullpath)
             spec.compiler.discardvisual = True
             model = spec.compile()
-            return model, mujoco.MjData(model)
+            return model, MjData(model)
 
         def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
             self._first_pass = True
@@ -54,8 +54,8 @@ def lean(task: str, stock: Any) -> Any:
             data.mocap_pos[0] = np.minimum(np.maximum(moved, self.mocap_low), self.mocap_high)
             data.mocap_quat[0] = _DOWN
             data.ctrl[:] = action[3], -action[3]
-            mujoco.mj_step(self.model, data, nstep=self.frame_skip)
-            mujoco.mj_forward(self.model, data)
+            mj_step(self.model, data, nstep=self.frame_skip)
+            mj_forward(self.model, data)
             self.curr_path_length += 1
             low, high = self._bounds
             observation = np.minimum(np.maximum(self._get_obs(), low), high)

@@ -1,0 +1,275 @@
+"""Environments in processes of their own, each process with several, so that they keep up with a fast learner.
+
+A worker (``python -m senior.envs.worker``) is told what to do in lines on one pipe and says that it is done on
+another. Numbers pass through memory that both share, so a step pickles nothing. A worker that died, or does not
+answer in time, is replaced, and its environments are brought back to where they were by their episodes' numbers
+and actions; nothing is lost, and the run is the same bit for bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from senior.envs.episodes import Failure, Step
+from senior.types import BadInput, EnvSpec
+
+PATIENCE = 120.0
+"""Seconds in which a worker must have taken a step, begun an episode or built an environment."""
+
+LIVES = 3
+"""Workers that may be lost at one and the same step before the environment is held to be the reason."""
+
+
+def layout(spec: EnvSpec) -> np.dtype[Any]:
+    """What a worker and its user share of one environment."""
+    o, a = spec.observation_size, spec.action_size
+    return np.dtype(
+        [
+            ("action", np.float32, a),
+            ("observation", np.float32, o),
+            ("next_observation", np.float32, o),
+            ("reward", np.float64),
+            ("success", np.float64),
+            ("terminated", np.bool_),
+            ("truncated", np.bool_),
+        ]
+    )
+
+
+class Lost(Exception):
+    """A worker died or does not answer; the text says how."""
+
+
+class Worker:
+    """One process.
+
+    ``life`` counts how often it was started: environments of an earlier life are gone. ``lost``: what the last one
+    died of.
+    """
+
+    def __init__(self, patience: float = PATIENCE) -> None:
+        self.patience = patience
+        self.life = 0
+        self.lost = ""
+        self._places = itertools.count()
+        self._start()
+
+    def _start(self) -> None:
+        orders, our_orders = os.pipe()
+        our_answers, answers = os.pipe()
+        self._orders, self._answers = (
+            os.fdopen(our_orders, "wb", buffering=0),
+            os.fdopen(our_answers, "rb", buffering=0),
+        )
+        # what is importable here is importable there
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        command = [sys.executable, "-m", "senior.envs.worker", str(orders), str(answers)]
+        self.process = subprocess.Popen(command, pass_fds=(orders, answers), env=environment, stdin=subprocess.DEVNULL)
+        os.close(orders)
+        os.close(answers)
+        self._waiting = select.poll()
+        self._waiting.register(self._answers, select.POLLIN)
+        self._arrived: dict[int, str] = {}
+        self._rest = b""
+        self.life += 1
+
+    def place(self) -> int:
+        """The number of a new place for an environment."""
+        return next(self._places)
+
+    def order(self, what: str, place: int, **details: Any) -> None:
+        """Have something done at a place; what it gave comes by `answer`."""
+        with contextlib.suppress(BrokenPipeError):  # `answer` will tell
+            self._orders.write(f"{what} {place} {json.dumps(details) if details else ''}\n".encode())
+
+    def answer(self, place: int) -> str:
+        """The answer to a place's last order: empty, or why it failed. Raises `Lost`."""
+        until = time.monotonic() + self.patience
+        while place not in self._arrived:
+            if not self._waiting.poll(1000 * max(0.0, until - time.monotonic())):
+                raise Lost(f"gave no answer for {self.patience:g} seconds")
+            read = self._answers.read(65536)
+            if not read:
+                code = self.process.wait()
+                how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+                raise Lost(f"died ({how})")
+            *lines, self._rest = (self._rest + read).split(b"\n")
+            for line in lines:
+                number, _, failure = line.decode().partition(" ")
+                self._arrived[int(number)] = failure
+            until = time.monotonic() + self.patience
+        return self._arrived.pop(place)
+
+    def restart(self, lost: Lost) -> None:
+        """Put a new process in the lost one's place."""
+        self.lost = str(lost)
+        self.close()
+        self._start()
+
+    def close(self) -> None:
+        """End the process, whatever it is doing."""
+        self.process.kill()
+        self.process.wait()
+        self._orders.close()
+        self._answers.close()
+
+
+class Remote:
+    """`senior.envs.episodes.Episodes` in a worker."""
+
+    def __init__(self, worker: Worker, made_by: dict[str, Any], spec: EnvSpec, seed: int, purpose: int) -> None:
+        """``made_by``: arguments of `senior.envs.make`, which gives ``spec``. ``seed``: the run's."""
+        self.spec = spec
+        self.observation = np.zeros(spec.observation_size, np.float32)
+        self.notes: list[str] = []
+        self.episode = 0
+        self._worker = worker
+        self._order = {"made_by": made_by, "seed": seed, "purpose": purpose}
+        self._place = worker.place()
+        self._life = 0  # of the worker, when the environment was built in it
+        self._actions: list[np.ndarray] = []  # taken in the running episode, the sent one last
+        self._failure: Failure | None = None
+
+    def begin(self, episode: int, afresh: bool = False) -> Failure | None:
+        """See `Episodes.begin`."""
+        self.episode, self._failure = episode, None
+        self._actions.clear()
+        if afresh:
+            self._life = 0
+        for life in range(LIVES):
+            try:
+                self._begin_there()
+                return self._failure
+            except Lost as lost:
+                self._worker.restart(lost)
+                if life == LIVES - 1:
+                    return self._fail(f"{LIVES} workers were lost at its beginning; the last one {lost}.")
+        return None
+
+    def send(self, action: np.ndarray) -> None:
+        """See `Episodes.send`."""
+        if self._failure is None:
+            self._actions.append(np.array(action, np.float32))
+            self._send()
+
+    def receive(self) -> Step | Failure:
+        """See `Episodes.receive`."""
+        for life in range(LIVES):
+            try:
+                if self._failure is None and self._life != self._worker.life:
+                    self._relive()
+                return self._failure or self._received()
+            except Lost as lost:
+                self._worker.restart(lost)
+                if life == LIVES - 1:
+                    return self._fail(f"{LIVES} workers were lost at this step; the last one {lost}.")
+        raise AssertionError
+
+    def close(self) -> None:
+        """See `Episodes.close`; the worker is closed by whoever made it."""
+        if self._life == self._worker.life:
+            self._worker.order("close", self._place)
+
+    def _ask(self, what: str, **details: Any) -> None:
+        """Have something rare done. Raises `Lost`; a failure becomes this object's."""
+        self._worker.order(what, self._place, **details)
+        message = self._worker.answer(self._place)
+        if message:
+            self._failure = Failure(json.loads(message))
+
+    def _begin_there(self) -> None:
+        """Begin the episode in the worker, built there if it is not yet."""
+        if self._life != self._worker.life:
+            with tempfile.TemporaryDirectory(prefix="senior-") as folder:
+                path = Path(folder) / "shared"
+                self._shared = np.memmap(path, dtype=layout(self.spec), mode="w+", shape=1)[0]
+                self._ask("open", **self._order, memory=str(path))
+            self._life = self._worker.life
+        if self._failure is None:
+            self._ask("begin", episode=self.episode)
+        self.observation = self._shared["observation"].copy()
+
+    def _send(self) -> None:
+        if self._life == self._worker.life:
+            self._shared["action"][:] = self._actions[-1]
+            self._worker.order("step", self._place)
+
+    def _received(self) -> Step | Failure:
+        message = self._worker.answer(self._place)
+        if message:
+            self._failure = Failure(json.loads(message))
+            return self._failure
+        shared = self._shared
+        success = float(shared["success"]) if self.spec.tells_success else None
+        step = Step(
+            self.observation,
+            self._actions[-1],
+            float(shared["reward"]),
+            shared["next_observation"].copy(),
+            bool(shared["terminated"]),
+            bool(shared["truncated"]),
+            success,
+        )
+        self.observation = shared["observation"].copy()
+        if step.ended:
+            self.episode += 1
+            self._actions.clear()
+        return step
+
+    def _relive(self) -> None:
+        """Bring the environment, in a new process, to the step at which the old one was lost, and go on from there."""
+        before, actions = self.observation, self._actions.copy()
+        self.notes.append(
+            f"The worker of the environment {self.spec.name} {self._worker.lost}; another took over in episode "
+            f"{self.episode} after step {len(actions) - 1}."
+        )
+        self._begin_there()
+        for action in actions[:-1]:
+            if self._failure is not None:
+                return
+            self._shared["action"][:] = action
+            self._ask("step")
+            self.observation = self._shared["observation"].copy()
+        if self._failure is None and not np.array_equal(before, self.observation):
+            self._fail("its worker was lost, and it does not repeat an episode from its seed and actions.")
+        elif self._failure is None:
+            self._send()
+
+    def _fail(self, why: str) -> Failure:
+        self._failure = Failure(
+            f"The environment {self.spec.name} of seed {self._order['seed']} failed in episode {self.episode} after "
+            f"step {max(0, len(self._actions) - 1)}: {why}"
+        )
+        return self._failure
+
+
+class Workers:
+    """A fixed number of workers; environments are dealt out to them in turn."""
+
+    def __init__(self, count: int, patience: float = PATIENCE) -> None:
+        if count < 1:
+            raise BadInput(f"There must be at least one worker, not {count}.")
+        self.workers = [Worker(patience) for _ in range(count)]
+        self._next = itertools.cycle(self.workers)
+
+    def next(self) -> Worker:
+        """The worker whose turn it is."""
+        return next(self._next)
+
+    def close(self) -> None:
+        """End all of them."""
+        for worker in self.workers:
+            worker.close()
