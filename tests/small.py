@@ -43,7 +43,9 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def preferences_dump(run: Path) -> list[tuple[Any, ...]]:
-    """All that was asked and answered, without the time of day."""
+    """All that was asked and answered, without the time of day; of plain SAC nothing."""
+    if not (run / "preferences.sqlite").exists():
+        return []
     with sqlite3.connect(run / "preferences.sqlite") as db:
         names = [row[1] for row in db.execute("PRAGMA table_info(pairs)") if row[1] != "answered_at"]
         found = db.execute(f"SELECT {', '.join(names)} FROM pairs ORDER BY id").fetchall()

@@ -360,8 +360,9 @@ def trained_with(arguments: str, monkeypatch: pytest.MonkeyPatch) -> tuple[Confi
     """What `program.train` is asked for."""
     asked: list[Any] = []
 
-    def instead(config: Config, out: Path, seeds: int, watcher: Any) -> list[Any]:
+    def instead(config: Config, out: Path, seeds: int, watcher: Any, **machine: Any) -> list[Any]:
         asked.extend((config, out, seeds))
+        assert machine == {"workers": None, "runs_per_device": None}
         return []
 
     monkeypatch.setattr(program, "train", instead)
@@ -417,7 +418,7 @@ def test_a_run_that_broke_is_told_and_ends_with_code_1(capsys: pytest.CaptureFix
         program.Result(Path("runs/arm/seed-0"), 0, 1000, True, None, 20, None),
         program.Result(Path("runs/arm/seed-1"), 1, 649, False, "The environment arm failed: motor burnt", 20, None),
     ]
-    monkeypatch.setattr(program, "train", lambda *_: results)
+    monkeypatch.setattr(program, "train", lambda *_, **_options: results)
     monkeypatch.setattr(program, "film_policy", lambda *_: "There is no video: arm draws nothing.")
     assert main(["train", "--seeds", "2"]) == FAILED
     told = capsys.readouterr().out

@@ -71,7 +71,7 @@ def test_the_command_in_an_example_is_one(path: Path, monkeypatch: pytest.Monkey
     command = re.search(r"^    senior (train .*)$", path.read_text(), re.MULTILINE)
     assert command
     asked = []
-    monkeypatch.setattr(program, "train", lambda config, out, *_: asked.append((config, out)) or [])
+    monkeypatch.setattr(program, "train", lambda config, out, *_, **_options: asked.append((config, out)) or [])
     assert cli.main(command[1].split()) == cli.DONE
     ((config, out),) = asked
     assert f"{path.stem}:" in f"{config.env} {config.method.select}"

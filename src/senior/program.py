@@ -104,6 +104,7 @@ def train_all(
     """
     if not runs:
         raise BadInput("There is no run to train.")
+    _check_machine(workers, runs_per_device)
     for config, _ in runs:
         check(config)
     if len({config.device for config, _ in runs}) > 1:
@@ -125,6 +126,13 @@ def train_all(
         for trainee in trainees:
             trainee.directory.create(trainee.config, rundir.protocol(trainee.spec, device))
         return _run([(trainee, trainee.begin) for trainee in trainees], watcher, lift, runs_per_device)
+
+
+def _check_machine(workers: int | None, runs_per_device: int | None) -> None:
+    if workers is not None and not 0 <= workers <= 1024:
+        raise BadInput(f"--workers {workers} must be between 0 and 1024.")
+    if runs_per_device is not None and runs_per_device < 1:
+        raise BadInput(f"--runs-per-device {runs_per_device} must be at least 1.")
 
 
 def _check_fit(config: Config, spec: EnvSpec) -> None:
@@ -153,6 +161,7 @@ def resume(
     do. ``workers``, ``runs_per_device``: see `train_all`. Raises `BadInput` if there is no run, or the only one cannot
     go on.
     """
+    _check_machine(workers, runs_per_device)
     watcher = watcher or Quiet()
     found = find_runs(path)
     with ExitStack() as stack:
@@ -317,8 +326,6 @@ def _workers(count: int | None, device: str, runs: int) -> Iterator[Workers | No
     """Processes for the environments of so many runs, until the end of the block; None: they live in this one."""
     if count is None:
         count = min(rundir.threads(), runs) if device == "gpu" else 0
-    if not 0 <= count <= 1024:
-        raise BadInput(f"--workers {count} must be between 0 and 1024.")
     pool = Workers(count) if count else None
     try:
         yield pool
@@ -393,8 +400,6 @@ def _together(
     trainees: Sequence[Trainee], device: str, lift: Lift, runs_per_device: int | None, watcher: Watcher
 ) -> int:
     """How many of the runs, from the first on, are trained at a time; tells what memory they take."""
-    if runs_per_device is not None and runs_per_device < 1:
-        raise BadInput(f"--runs-per-device {runs_per_device} must be at least 1.")
     sizes = [state_bytes(trainee.learner, trainee.config) for trainee in trainees]
     # under vmap states are there twice while they are put into one array
     room = np.cumsum(sizes) * (2 if lift == "vmap" else 1) <= 0.9 * device_memory(device)
