@@ -30,17 +30,20 @@ from senior.methods import METHODS
 from senior.presets import preset
 from senior.runs import Runs, lift_for, prepare_device
 from senior.trainee import Trainee
-from senior.types import BadInput
+from senior.types import BadInput, EnvSpec
 
 PARTS = ("act", "environment", "update", "store")
 WARM_UP = 100
+PRETRAINING = 300  # its last steps, which are the slowest
 
 
 @dataclass
 class Window:
-    """A watcher that notes the time at the beginning and the end of two windows, the second with waiting."""
+    """A watcher that notes the time at the beginning and the end of three windows: of pre-training, and two of the
+    main phase, the second with waiting."""
 
     training: Training | None
+    pretraining: tuple[int, int]
     warm: int
     length: int
     stop: bool = False
@@ -51,6 +54,9 @@ class Window:
     def advance(self, step: int, trainees: Sequence[Trainee]) -> None:
         assert self.training is not None
         start = self.warm
+        if step in self.pretraining:
+            self.training.wait()
+            self.marks[step] = time.perf_counter()
         if step in (start, start + self.length, start + 2 * self.length):
             self.training.wait()
             self.marks[step] = time.perf_counter()
@@ -120,7 +126,8 @@ def measure(config: Config, runs: int, device: str, length: int, out: Path) -> d
     for trainee in trainees:
         trainee.reset(0)
         trainee.directory.create(trainee.config, {})
-    window = Window(None, start, length)
+    late = config.pretraining.until
+    window = Window(None, (late - PRETRAINING, late - 1), start, length)
     states = Runs([trainee.begin() for trainee in trainees], lift_for(device))
     window.training = training = Training(trainees, states, window)
     training.last = start + 2 * length
@@ -141,6 +148,8 @@ def measure(config: Config, runs: int, device: str, length: int, out: Path) -> d
     figures["update_floor_ms"] = 1e3 * multiply_adds(config, learner) / rate
     figures["product_gflops"] = rate / 1e9
     if learns:
+        began, ended = (window.marks[at] for at in window.pretraining)
+        figures["pretraining_steps_per_second"] = (PRETRAINING - 1) * runs / (ended - began)
         n, step = config.queries.per_session, training.last
         spent = []
         for i in range(2):
@@ -177,9 +186,11 @@ def _peak_gigabytes() -> float:
     return peak / (2**30 if sys.platform == "darwin" else 2**20)
 
 
-def run(method: str, preset_name: str, task: str, steps: int, runs: int, device: str, json_file: Path | None) -> None:
+def run(
+    method: str, preset_name: str, task: str, steps: int, runs: Sequence[int], device: str, json_file: Path | None
+) -> None:
     """`senior bench`: print the figures of one method or of all, and keep them as JSON where asked."""
-    if steps < 1 or runs < 1:
+    if steps < 1 or min(runs, default=0) < 1:
         raise BadInput("--steps and --runs must be at least 1.")
     if method != "all" and method not in METHODS:
         raise BadInput.unknown("method", method, METHODS)
@@ -188,31 +199,50 @@ def run(method: str, preset_name: str, task: str, steps: int, runs: int, device:
     names = list(METHODS) if method == "all" else [method]
     configs = [preset(preset_name, task, name) for name in names]
     device = prepare_device(device)
-    spec = program.spec_of(configs[0])
-    machine = {key: rundir.protocol(spec, device)[key] for key in ("device", "threads", "machine", "packages")}
+    machine = _machine(program.spec_of(configs[0]), device)
+    print(f"{machine['device']}, {machine['threads']} threads, {machine['machine']}; {task}, {preset_name}")
     print(
-        f"{machine['device']}, {machine['threads']} threads, {machine['machine']}; {task}, {preset_name}, {runs} run(s)"
-    )
-    print(
-        f"{'method':10} {'steps/s':>8} | {'act':>6} {'env':>6} {'update':>7} {'(floor)':>7} {'store':>6} ms | "
-        f"{'session':>8} {'relabel':>8} s | {'to start':>8} s | {'memory':>7} GB"
+        f"{'method':10} {'runs':>4} {'steps/s':>8} | {'act':>6} {'env':>6} {'update':>7} {'(floor)':>7} {'store':>6} "
+        f"ms | {'pretraining':>11} /s | {'session':>8} {'relabel':>8} s | {'to start':>8} s | {'memory':>7} GB"
     )
     found = []
-    for config in configs:
+    for config, count in ((config, count) for config in configs for count in runs):
         with tempfile.TemporaryDirectory() as folder:
-            figures = measure(config, runs, device, steps, Path(folder))
+            figures = measure(config, count, device, steps, Path(folder))
         found.append(figures)
         missing = float("nan")
         ms = figures["milliseconds"]
         print(
-            f"{figures['method']:10} {figures['steps_per_second']:8.1f} | {ms['act']:6.2f} {ms['environment']:6.2f} "
-            f"{ms['update']:7.2f} {figures['update_floor_ms']:7.2f} {ms['store']:6.2f}    | "
-            f"{figures.get('session_seconds', missing):8.2f} {figures.get('relabel_seconds', missing):8.2f}   | "
-            f"{figures['to_main_phase_seconds']:8.1f}   | {figures['resident_gigabytes']:7.2f}",
+            f"{figures['method']:10} {count:4} {figures['steps_per_second']:8.1f} | {ms['act']:6.2f} "
+            f"{ms['environment']:6.2f} {ms['update']:7.2f} {figures['update_floor_ms']:7.2f} {ms['store']:6.2f}    "
+            f"| {figures.get('pretraining_steps_per_second', missing):11.1f}    "
+            f"| {figures.get('session_seconds', missing):8.2f} {figures.get('relabel_seconds', missing):8.2f}   "
+            f"| {figures['to_main_phase_seconds']:8.1f}   | {figures['resident_gigabytes']:7.2f}",
             flush=True,
         )
     print(
-        "memory: the process's peak so far; relabel: a full replay of a million rows; floor: see benchmarks/README.md"
+        "steps/s: of all runs together; milliseconds: per step of one run; memory: the process's peak so far; relabel: "
+        "a full replay of a million rows; floor: see benchmarks/README.md"
     )
+    _keep(json_file, {"machine": machine, "task": task, "figures": found})
+
+
+def run_environments(task: str, count: int, json_file: Path | None) -> None:
+    """`senior bench --environments N`: environments alone."""
+    from senior import bench_environments
+
+    if count < 1:
+        raise BadInput("--environments must be at least 1.")
     if json_file:
-        json_file.write_text(json.dumps({"machine": machine, "task": task, "figures": found}, indent=2) + "\n")
+        rundir.make_room(json_file)
+    figures = bench_environments.run(task, count)
+    _keep(json_file, {"machine": _machine(program.spec_of(preset("paper", task, "sac")), "cpu"), "figures": figures})
+
+
+def _machine(spec: EnvSpec, device: str) -> dict[str, Any]:
+    return {key: rundir.protocol(spec, device)[key] for key in ("device", "threads", "machine", "packages")}
+
+
+def _keep(json_file: Path | None, found: dict[str, Any]) -> None:
+    if json_file:
+        json_file.write_text(json.dumps(found, indent=2) + "\n")

@@ -71,7 +71,7 @@ class EvalOptions:
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """Steps per second of the main phase, and where the time goes."""
+    """Steps per second of the main phase, of pre-training and of environments alone, and where the time goes."""
 
     method: str = "all"
     """A method of `senior methods`, or all."""
@@ -81,8 +81,10 @@ class BenchOptions:
     """A task of `senior tasks`."""
     steps: int = 300
     """Main-phase steps to time, after the warm-up."""
-    runs: int = 1
-    """Runs in the program."""
+    runs: tuple[int, ...] = (1,)
+    """Runs in the program; several numbers are measured one after the other."""
+    environments: int | None = None
+    """Only step so many environments of the task, without learning: stock, here, and in worker processes."""
     device: str = "auto"
     """auto, cpu or gpu."""
     json: Path | None = None
@@ -280,6 +282,9 @@ def _bench(arguments: list[str]) -> int:
     options = parse(BenchOptions, arguments, None, "bench")
     from senior import bench
 
+    if options.environments is not None:
+        bench.run_environments(options.task, options.environments, options.json)
+        return DONE
     bench.run(
         options.method,
         options.preset,
