@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -49,7 +50,7 @@ def insert(entropy: StateEntropy, state: Float[Array, " o"]) -> StateEntropy:
     distance = jnp.where(known, distance, jnp.inf)
     before = jnp.concatenate([jnp.full((capacity, 1), -jnp.inf), entropy.nearest[:, :-1]], axis=1)
     nearest = jnp.maximum(before, jnp.minimum(entropy.nearest, distance[:, None]))
-    nearest = nearest.at[row].set(jnp.sort(distance)[:keep], mode="drop")
+    nearest = nearest.at[row].set(-jax.lax.top_k(-distance, keep)[0], mode="drop")
     full = row >= capacity
     return entropy._replace(
         states=states,
