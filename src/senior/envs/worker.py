@@ -1,7 +1,7 @@
 """The process behind `senior.envs.workers`: takes orders, one per line, until nobody can give any more.
 
-Orders are ``open``, ``begin``, ``step`` and ``close``, with a place and details as JSON. Each is answered by a line
-with the place, and after it, where something failed, the sentence that tells why.
+Orders are ``step`` with places, and ``open``, ``begin`` and ``close`` with a place and details as JSON. Each is
+answered by lines (``close`` by none), one per place: its number and, where something failed, why.
 """
 
 from __future__ import annotations
@@ -10,13 +10,12 @@ import json
 import os
 import signal
 import sys
+from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from senior import envs
 from senior.envs.episodes import Failure, Local
-from senior.envs.workers import layout
+from senior.envs.workers import Shared
 
 
 class Place:
@@ -24,24 +23,23 @@ class Place:
 
     def __init__(self, made_by: dict[str, Any], seed: int, purpose: int, memory: str) -> None:
         self.local = Local(lambda: envs.make(**made_by), seed, purpose)
-        self.shared = np.memmap(memory, dtype=layout(self.local.spec), mode="r+", shape=1)[0]
+        self.shared = Shared(Path(memory), self.local.spec)
 
     def begin(self, episode: int) -> Failure | None:
         failure = self.local.begin(episode)
-        self.shared["observation"] = self.local.observation
+        self.shared.observation[:] = self.local.observation
         return failure
 
     def step(self) -> Failure | None:
-        self.local.send(self.shared["action"])
+        shared = self.shared
+        self.local.send(shared.action)
         step = self.local.receive()
         if isinstance(step, Failure):
             return step
-        self.shared["next_observation"] = step.next_observation
-        self.shared["observation"] = self.local.observation
-        self.shared["reward"] = step.reward
-        self.shared["success"] = step.success or 0.0
-        self.shared["terminated"] = step.terminated
-        self.shared["truncated"] = step.truncated
+        shared.next_observation[:] = step.next_observation
+        shared.observation[:] = self.local.observation
+        shared.numbers[:] = step.reward, step.success or 0.0
+        shared.ends[:] = step.terminated, step.truncated
         return None
 
 
@@ -51,25 +49,29 @@ def main(orders: int, answers: int) -> None:
     places: dict[int, Place] = {}
     with open(orders, "rb") as read:
         for line in read:
-            what, number, details = line.decode().split(" ", 2)
-            place, failure = int(number), None
-            match what:
-                case "step":
-                    failure = places[place].step()
-                case "begin":
-                    failure = places[place].begin(**json.loads(details))
-                case "open":
-                    if place in places:
-                        places.pop(place).local.close()
-                    try:
-                        places[place] = Place(**json.loads(details))
-                    except Exception as error:
-                        failure = Failure(f"{type(error).__name__}: {' '.join(str(error).split())}")
-                case "close":
-                    places.pop(place).local.close()
-                    continue
-            told = f" {json.dumps(failure.message)}" if failure else ""
-            os.write(answers, f"{place}{told}\n".encode())
+            what, rest = line.decode().split(" ", 1)
+            if what == "step":
+                failures = [(int(place), places[int(place)].step()) for place in rest.split()]
+            else:
+                number, details = rest.split(" ", 1)
+                place = int(number)
+                failures = [(place, _rare(places, what, place, json.loads(details)))]
+            if what != "close":
+                told = (f"{place} {json.dumps(failure.message) if failure else ''}\n" for place, failure in failures)
+                os.write(answers, "".join(told).encode())
+
+
+def _rare(places: dict[int, Place], what: str, place: int, details: dict[str, Any]) -> Failure | None:
+    if what == "begin":
+        return places[place].begin(**details)
+    if place in places:
+        places.pop(place).local.close()
+    if what == "open":
+        try:
+            places[place] = Place(**details)
+        except Exception as error:
+            return Failure(f"{type(error).__name__}: {' '.join(str(error).split())}")
+    return None
 
 
 if __name__ == "__main__":

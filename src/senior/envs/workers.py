@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,20 +34,22 @@ LIVES = 3
 """Workers that may be lost at one and the same step before the environment is held to be the reason."""
 
 
-def layout(spec: EnvSpec) -> np.dtype[Any]:
-    """What a worker and its user share of one environment."""
-    o, a = spec.observation_size, spec.action_size
-    return np.dtype(
-        [
+class Shared:
+    """What a worker and its user share of one environment: arrays in a file that both have in memory."""
+
+    def __init__(self, path: Path, spec: EnvSpec) -> None:
+        o, a = spec.observation_size, spec.action_size
+        fields = [
+            ("numbers", np.float64, 2),
+            ("observations", np.float32, (2, o)),
             ("action", np.float32, a),
-            ("observation", np.float32, o),
-            ("next_observation", np.float32, o),
-            ("reward", np.float64),
-            ("success", np.float64),
-            ("terminated", np.bool_),
-            ("truncated", np.bool_),
+            ("ends", np.bool_, 2),
         ]
-    )
+        shared = np.asarray(np.memmap(path, dtype=fields, mode="r+" if path.exists() else "w+", shape=1))
+        self.observation, self.next_observation = shared["observations"][0]
+        self.action = shared["action"][0]
+        self.numbers = shared["numbers"][0]  # reward, success
+        self.ends = shared["ends"][0]  # terminated, truncated
 
 
 class Lost(Exception):
@@ -60,8 +63,10 @@ class Worker:
     died of.
     """
 
-    def __init__(self, patience: float = PATIENCE) -> None:
+    def __init__(self, patience: float, fellows: Sequence[Worker]) -> None:
+        """``fellows``: those that take their orders when this one does, itself included."""
         self.patience = patience
+        self.fellows = fellows
         self.life = 0
         self.lost = ""
         self._places = itertools.count()
@@ -82,6 +87,7 @@ class Worker:
         os.close(answers)
         self._waiting = select.poll()
         self._waiting.register(self._answers, select.POLLIN)
+        self._steps: list[str] = []
         self._arrived: dict[int, str] = {}
         self._rest = b""
         self.life += 1
@@ -90,13 +96,29 @@ class Worker:
         """The number of a new place for an environment."""
         return next(self._places)
 
+    def step(self, place: int) -> None:
+        """Have a step taken at a place, with others at once; what it gave comes by `answer`."""
+        self._steps.append(str(place))
+
     def order(self, what: str, place: int, **details: Any) -> None:
-        """Have something done at a place; what it gave comes by `answer`."""
+        """Have something rare done at a place; what it gave comes by `answer`."""
+        self.set_out()
+        self._write(f"{what} {place} {json.dumps(details)}\n")
+
+    def set_out(self) -> None:
+        """Begin the steps that are to be taken."""
+        if self._steps:
+            self._write(f"step {' '.join(self._steps)}\n")
+            self._steps.clear()
+
+    def _write(self, line: str) -> None:
         with contextlib.suppress(BrokenPipeError):  # `answer` will tell
-            self._orders.write(f"{what} {place} {json.dumps(details) if details else ''}\n".encode())
+            self._orders.write(line.encode())
 
     def answer(self, place: int) -> str:
         """The answer to a place's last order: empty, or why it failed. Raises `Lost`."""
+        for fellow in self.fellows:
+            fellow.set_out()
         until = time.monotonic() + self.patience
         while place not in self._arrived:
             if not self._waiting.poll(1000 * max(0.0, until - time.monotonic())):
@@ -186,44 +208,48 @@ class Remote:
     def _ask(self, what: str, **details: Any) -> None:
         """Have something rare done. Raises `Lost`; a failure becomes this object's."""
         self._worker.order(what, self._place, **details)
+        self._heard()
+
+    def _heard(self) -> Failure | None:
+        """What failed, if anything did, of what was last asked for."""
         message = self._worker.answer(self._place)
         if message:
             self._failure = Failure(json.loads(message))
+        return self._failure
 
     def _begin_there(self) -> None:
         """Begin the episode in the worker, built there if it is not yet."""
         if self._life != self._worker.life:
             with tempfile.TemporaryDirectory(prefix="senior-") as folder:
                 path = Path(folder) / "shared"
-                self._shared = np.memmap(path, dtype=layout(self.spec), mode="w+", shape=1)[0]
+                self._shared = Shared(path, self.spec)
                 self._ask("open", **self._order, memory=str(path))
             self._life = self._worker.life
         if self._failure is None:
             self._ask("begin", episode=self.episode)
-        self.observation = self._shared["observation"].copy()
+        self.observation = self._shared.observation.copy()
 
     def _send(self) -> None:
         if self._life == self._worker.life:
-            self._shared["action"][:] = self._actions[-1]
-            self._worker.order("step", self._place)
+            self._shared.action[:] = self._actions[-1]
+            self._worker.step(self._place)
 
     def _received(self) -> Step | Failure:
-        message = self._worker.answer(self._place)
-        if message:
-            self._failure = Failure(json.loads(message))
-            return self._failure
+        failure = self._heard()
+        if failure is not None:
+            return failure
         shared = self._shared
-        success = float(shared["success"]) if self.spec.tells_success else None
+        (reward, success), (terminated, truncated) = shared.numbers.tolist(), shared.ends.tolist()
         step = Step(
             self.observation,
             self._actions[-1],
-            float(shared["reward"]),
-            shared["next_observation"].copy(),
-            bool(shared["terminated"]),
-            bool(shared["truncated"]),
-            success,
+            reward,
+            shared.next_observation.copy(),
+            terminated,
+            truncated,
+            success if self.spec.tells_success else None,
         )
-        self.observation = shared["observation"].copy()
+        self.observation = shared.observation.copy()
         if step.ended:
             self.episode += 1
             self._actions.clear()
@@ -240,9 +266,10 @@ class Remote:
         for action in actions[:-1]:
             if self._failure is not None:
                 return
-            self._shared["action"][:] = action
-            self._ask("step")
-            self.observation = self._shared["observation"].copy()
+            self._shared.action[:] = action
+            self._worker.step(self._place)
+            self._heard()
+            self.observation = self._shared.observation.copy()
         if self._failure is None and not np.array_equal(before, self.observation):
             self._fail("its worker was lost, and it does not repeat an episode from its seed and actions.")
         elif self._failure is None:
@@ -262,7 +289,8 @@ class Workers:
     def __init__(self, count: int, patience: float = PATIENCE) -> None:
         if count < 1:
             raise BadInput(f"There must be at least one worker, not {count}.")
-        self.workers = [Worker(patience) for _ in range(count)]
+        self.workers: list[Worker] = []
+        self.workers += [Worker(patience, self.workers) for _ in range(count)]
         self._next = itertools.cycle(self.workers)
 
     def next(self) -> Worker:
