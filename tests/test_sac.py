@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from senior.agent import sac
-from senior.agent.networks import MLP, normalised_relu
+from senior.agent.networks import MLP, Arithmetic, normalised_relu
 from senior.types import Batch, Source
 from tests.numeric import Arrays, numeric_gradient
 
@@ -169,9 +169,9 @@ def test_critics_descend_on_the_squared_error_to_the_bootstrapped_target(normali
     agent, batch, key = agent_of(5), batch_of(6), jax.random.key(7)
     assert 0 < batch.bootstrap.sum() < B
     reward = np.linspace(-1, 2, B)
-    activation = normalised_relu if normalised else jax.nn.relu
+    arithmetic = Arithmetic(normalised_relu if normalised else jax.nn.relu)
     update = jax.jit(sac.update_critics, static_argnums=5)
-    after, info = update(agent, batch, jnp.asarray(reward), key, NUMBERS, activation)
+    after, info = update(agent, batch, jnp.asarray(reward), key, NUMBERS, arithmetic)
 
     action, log_prob = policy(flat(agent.actor), batch.next_observation, noise_of(key))
     value = q_values(flat(agent.targets), batch.next_observation, action, normalised).min(axis=0)
@@ -189,8 +189,8 @@ def test_critics_descend_on_the_squared_error_to_the_bootstrapped_target(normali
 @NORMALISED
 def test_actor_descends_on_alpha_log_pi_minus_the_smaller_q(normalised: bool):
     agent, batch, key = agent_of(8), batch_of(9), jax.random.key(10)
-    activation = normalised_relu if normalised else jax.nn.relu
-    after, info = jax.jit(sac.update_actor, static_argnums=4)(agent, batch, key, NUMBERS, activation)
+    arithmetic = Arithmetic(normalised_relu if normalised else jax.nn.relu)
+    after, info = jax.jit(sac.update_actor, static_argnums=4)(agent, batch, key, NUMBERS, arithmetic)
     critics, noise, alpha = flat(agent.critics), noise_of(key), np.exp(float(agent.log_alpha))
 
     def loss(actor: Arrays) -> float:

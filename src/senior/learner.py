@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from senior import replay as replay_
 from senior.agent import sac
-from senior.agent.networks import MLP, normalised_relu
+from senior.agent.networks import MLP, Arithmetic, bfloat16_product, normalised_relu
 from senior.config import Config
 from senior.explore import Bonus, Now, preference_guided, state_entropy
 from senior.replay import Fact, Replay
@@ -127,7 +127,10 @@ class Learner:
         self.config = shape(config)
         self.spec = spec
         self.bonus = bonus
-        self.critic = normalised_relu if config.networks.layer_norm else jax.nn.relu
+        self.arithmetic = Arithmetic(
+            normalised_relu if config.networks.layer_norm else jax.nn.relu,
+            bfloat16_product if config.precision == "bfloat16" else jnp.matmul,
+        )
         self._compiled_init = jax.jit(self._init)
 
     def init(self, config: Config) -> Run:
@@ -195,7 +198,7 @@ class Learner:
             batch = replay_.sample(run.replay, key_batch, self.config.sac.batch)
             deviation, reward = state_entropy.reward(_some(run.entropy), state[1], batch.row)
             move = nth % self.config.sac.target_every == 0
-            agent, info = sac.update(state[0], batch, reward, key_update, run.numbers.sac, move, self.critic)
+            agent, info = sac.update(state[0], batch, reward, key_update, run.numbers.sac, move, self.arithmetic)
             return (agent, deviation), info
 
         (agent, deviation), info = _in_turn(one, (run.agent, _some(run.deviation)), step * times + jnp.arange(times))
@@ -257,8 +260,9 @@ class Learner:
             batch = replay_.sample(run.replay, key_batch, self.config.sac.batch)
         separate = self.config.bilevel.optimizer == "separate"
         numbers = run.numbers.outer._replace(inner_rate=self._decayed(run, step).critic_rate)
+        exact = self.arithmetic._replace(product=jnp.matmul)
         fitted, info = bilevel.outer_step(
-            _some(run.model), run.agent, batch, pairs, key_value, numbers, separate, self.critic
+            _some(run.model), run.agent, batch, pairs, key_value, numbers, separate, exact
         )
         return self.relabel(run._replace(model=fitted))[0], info
 
@@ -322,7 +326,7 @@ class Learner:
             paid = self.bonus.value(run.bonus, batch, now)
             reward = batch.learned_reward + paid if self.config.method.learns_reward else batch.reward
             move = nth % self.config.sac.target_every == 0
-            agent, info = sac.update(agent, batch, reward, key_update, numbers, move, self.critic)
+            agent, info = sac.update(agent, batch, reward, key_update, numbers, move, self.arithmetic)
             told = self.bonus.report(run.bonus, batch, now)
             shares = {
                 f"{source.name.lower()}_share": jnp.mean(batch.source == source)

@@ -13,12 +13,47 @@ from jaxtyping import Array, Float, PRNGKeyArray
 Tree = TypeVar("Tree")
 Initialiser = Callable[[PRNGKeyArray, int, int], tuple[Array, Array]]
 Activation = Callable[[Array], Array]
+Product = Callable[[Array, Array], Array]
 
 
 def normalised_relu(x: Float[Array, "*b n"]) -> Float[Array, "*b n"]:
     """ReLU of a layer brought to mean 0 and variance 1: layer normalisation (Ba et al. 2016) that learns nothing."""
     x = x - x.mean(axis=-1, keepdims=True)
     return jax.nn.relu(x * jax.lax.rsqrt(jnp.mean(x**2, axis=-1, keepdims=True) + 1e-5))
+
+
+def _with_float32_sums(x: Float[Array, "b i"], w: Float[Array, "i o"]) -> Float[Array, "b o"]:
+    return jax.lax.dot(x, w, preferred_element_type=jnp.float32)
+
+
+@jax.custom_vjp
+def bfloat16_product(x: Float[Array, "b i"], w: Float[Array, "i o"]) -> Float[Array, "b o"]:
+    """``x @ w`` of float32, multiplied in bfloat16 and summed in float32; so are both products of its gradient.
+
+    XLA's fast kernels for a CPU take a plain product only, so that the gradient's transposes are made before.
+    """
+    return _with_float32_sums(x.astype(jnp.bfloat16), w.astype(jnp.bfloat16))
+
+
+def _forward(x: Array, w: Array) -> tuple[Array, tuple[Array, Array]]:
+    x, w = x.astype(jnp.bfloat16), w.astype(jnp.bfloat16)
+    return _with_float32_sums(x, w), (x, w)
+
+
+def _backward(kept: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
+    x_transposed, w_transposed = (jax.lax.optimization_barrier(one.T) for one in kept)
+    gradient = gradient.astype(jnp.bfloat16)
+    return _with_float32_sums(gradient, w_transposed), _with_float32_sums(x_transposed, gradient)
+
+
+bfloat16_product.defvjp(_forward, _backward)
+
+
+class Arithmetic(NamedTuple):
+    """How the networks of an update compute."""
+
+    activation: Activation = jax.nn.relu  # of the critics' hidden layers; the actor's are ReLU
+    product: Product = jnp.matmul  # of activations [b, i] and weights [i, o]
 
 
 adam = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-8)
@@ -65,11 +100,13 @@ def init_mlp(key: PRNGKeyArray, size_in: int, layers: int, width: int, size_out:
     return MLP(tuple(weight for weight, _ in made), tuple(bias for _, bias in made))
 
 
-def apply_mlp(mlp: MLP, x: Float[Array, "*batch n"], activation: Activation) -> Float[Array, "*batch m"]:
+def apply_mlp(
+    mlp: MLP, x: Float[Array, "*batch n"], activation: Activation, product: Product = jnp.matmul
+) -> Float[Array, "*batch m"]:
     """Hidden layers with the activation, the last layer linear."""
     for weight, bias in zip(mlp.weights[:-1], mlp.biases[:-1], strict=True):
-        x = activation(x @ weight + bias)
-    return x @ mlp.weights[-1] + mlp.biases[-1]
+        x = activation(product(x, weight) + bias)
+    return product(x, mlp.weights[-1]) + mlp.biases[-1]
 
 
 def descend(

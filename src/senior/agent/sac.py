@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from senior.agent.networks import MLP, Activation, adam, apply_mlp, descend, init_mlp, orthogonal
+from senior.agent.networks import MLP, Arithmetic, Product, adam, apply_mlp, descend, init_mlp, orthogonal
 from senior.types import Batch
 
 LOG_STD_RANGE = (-5.0, 2.0)
+FLOAT32 = Arithmetic()
 
 
 class Agent(NamedTuple):
@@ -76,18 +77,20 @@ def renew_critics(agent: Agent, key: PRNGKeyArray) -> Agent:
     )
 
 
-def distribution(actor: MLP, observation: Float[Array, "*b o"]) -> tuple[Float[Array, "*b a"], Float[Array, "*b a"]]:
+def distribution(
+    actor: MLP, observation: Float[Array, "*b o"], product: Product = jnp.matmul
+) -> tuple[Float[Array, "*b a"], Float[Array, "*b a"]]:
     """Mean and log standard deviation of the Gaussian before squashing; the latter is kept in its range by a tanh."""
-    mean, raw = jnp.split(apply_mlp(actor, observation, jax.nn.relu), 2, axis=-1)
+    mean, raw = jnp.split(apply_mlp(actor, observation, jax.nn.relu, product), 2, axis=-1)
     low, high = LOG_STD_RANGE
     return mean, low + 0.5 * (high - low) * (jnp.tanh(raw) + 1)
 
 
 def sample(
-    actor: MLP, observation: Float[Array, "*b o"], key: PRNGKeyArray
+    actor: MLP, observation: Float[Array, "*b o"], key: PRNGKeyArray, product: Product = jnp.matmul
 ) -> tuple[Float[Array, "*b a"], Float[Array, "*b"]]:
     """A squashed Gaussian action in [-1, 1] and its log probability."""
-    mean, log_std = distribution(actor, observation)
+    mean, log_std = distribution(actor, observation, product)
     noise = jax.random.normal(key, mean.shape)
     u = mean + jnp.exp(log_std) * noise
     gaussian = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
@@ -101,19 +104,17 @@ def mean_action(actor: MLP, observation: Float[Array, "*b o"]) -> Float[Array, "
 
 
 def values(
-    critics: MLP, observation: Float[Array, "b o"], action: Float[Array, "b a"], activation: Activation = jax.nn.relu
+    critics: MLP, observation: Float[Array, "b o"], action: Float[Array, "b a"], arithmetic: Arithmetic = FLOAT32
 ) -> Float[Array, "2 b"]:
-    """Q of both critics; ``activation``: of their hidden layers."""
+    """Q of both critics."""
     x = jnp.concatenate([observation, action], axis=-1)
-    return jax.vmap(lambda one: apply_mlp(one, x, activation)[..., 0])(critics)
+    return jax.vmap(lambda one: apply_mlp(one, x, *arithmetic)[..., 0])(critics)
 
 
-def next_value(
-    agent: Agent, batch: Batch, key: PRNGKeyArray, activation: Activation = jax.nn.relu
-) -> Float[Array, " b"]:
+def next_value(agent: Agent, batch: Batch, key: PRNGKeyArray, arithmetic: Arithmetic = FLOAT32) -> Float[Array, " b"]:
     """min_j Q_j'(s', a') - alpha log pi(a' | s'), with a' drawn from the policy."""
-    action, log_prob = sample(agent.actor, batch.next_observation, key)
-    target = values(agent.targets, batch.next_observation, action, activation).min(axis=0)
+    action, log_prob = sample(agent.actor, batch.next_observation, key, arithmetic.product)
+    target = values(agent.targets, batch.next_observation, action, arithmetic).min(axis=0)
     return target - jnp.exp(agent.log_alpha) * log_prob
 
 
@@ -123,13 +124,13 @@ def update_critics(
     reward: Float[Array, " b"],
     key: PRNGKeyArray,
     numbers: Numbers,
-    activation: Activation = jax.nn.relu,
+    arithmetic: Arithmetic = FLOAT32,
 ) -> tuple[Agent, dict[str, Array]]:
     """One Adam step of both critics towards r + gamma m V(s')."""
-    target = reward + numbers.discount * batch.bootstrap * next_value(agent, batch, key, activation)
+    target = reward + numbers.discount * batch.bootstrap * next_value(agent, batch, key, arithmetic)
 
     def loss_of(critics: MLP) -> tuple[Array, Array]:
-        q = values(critics, batch.observation, batch.action, activation)
+        q = values(critics, batch.observation, batch.action, arithmetic)
         return jnp.mean((q - target) ** 2, axis=1).sum(), q.mean()
 
     (loss, q), gradient = jax.value_and_grad(loss_of, has_aux=True)(agent.critics)
@@ -138,13 +139,13 @@ def update_critics(
 
 
 def update_actor(
-    agent: Agent, batch: Batch, key: PRNGKeyArray, numbers: Numbers, activation: Activation = jax.nn.relu
+    agent: Agent, batch: Batch, key: PRNGKeyArray, numbers: Numbers, arithmetic: Arithmetic = FLOAT32
 ) -> tuple[Agent, dict[str, Array]]:
     """One Adam step of the actor on alpha log pi - min_j Q_j."""
 
     def loss_of(actor: MLP) -> tuple[Array, Array]:
-        action, log_prob = sample(actor, batch.observation, key)
-        q = values(agent.critics, batch.observation, action, activation).min(axis=0)
+        action, log_prob = sample(actor, batch.observation, key, arithmetic.product)
+        q = values(agent.critics, batch.observation, action, arithmetic).min(axis=0)
         return jnp.mean(jnp.exp(agent.log_alpha) * log_prob - q), -log_prob.mean()
 
     (loss, entropy), gradient = jax.value_and_grad(loss_of, has_aux=True)(agent.actor)
@@ -168,15 +169,12 @@ def update(
     key: PRNGKeyArray,
     numbers: Numbers,
     move_targets: Array | bool,
-    activation: Activation = jax.nn.relu,
+    arithmetic: Arithmetic = FLOAT32,
 ) -> tuple[Agent, dict[str, Array]]:
-    """Critics, actor, temperature, and the targets where ``move_targets`` is true, all on one batch.
-
-    activation: of the critics' hidden layers.
-    """
+    """Critics, actor, temperature, and the targets where ``move_targets`` is true, all on one batch."""
     key_critics, key_actor = jax.random.split(key)
-    agent, of_critics = update_critics(agent, batch, reward, key_critics, numbers, activation)
-    agent, of_actor = update_actor(agent, batch, key_actor, numbers, activation)
+    agent, of_critics = update_critics(agent, batch, reward, key_critics, numbers, arithmetic)
+    agent, of_actor = update_actor(agent, batch, key_actor, numbers, arithmetic)
     agent, of_alpha = update_temperature(agent, of_actor["entropy"], batch.action.shape[-1], numbers)
     tau = jnp.where(move_targets, numbers.tau, 0.0)
     targets = jax.tree.map(lambda slow, fast: slow + tau * (fast - slow), agent.targets, agent.critics)

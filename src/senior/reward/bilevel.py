@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from senior.agent import sac
-from senior.agent.networks import MLP, Activation, descend
+from senior.agent.networks import MLP, Arithmetic, descend
 from senior.reward.model import RewardModel, Scaling, cross_entropy, rewards, targets
 from senior.types import Batch
 
@@ -47,7 +47,7 @@ def outer_loss(
     pairs: FirstSteps,
     numbers: OuterNumbers,
     scaling: Scaling | None,
-    activation: Activation = jax.nn.relu,
+    arithmetic: Arithmetic = sac.FLOAT32,
 ) -> Float[Array, ""]:
     """Preference loss of critics moved one step by the learned reward; differentiable in ``members``.
 
@@ -57,13 +57,13 @@ def outer_loss(
     target = reward + numbers.discount * batch.bootstrap * next_value
 
     def inner_loss(critics: MLP) -> Array:
-        q = sac.values(critics, batch.observation, batch.action, activation)
+        q = sac.values(critics, batch.observation, batch.action, arithmetic)
         return jnp.mean((q - target) ** 2, axis=1).sum()
 
     gradient = jax.grad(inner_loss)(critics)
     virtual = jax.tree.map(lambda parameter, step: parameter - numbers.inner_rate * step, critics, gradient)
     m = pairs.label.shape[0]
-    q = sac.values(virtual, pairs.observation.reshape(2 * m, -1), pairs.action.reshape(2 * m, -1), activation)
+    q = sac.values(virtual, pairs.observation.reshape(2 * m, -1), pairs.action.reshape(2 * m, -1), arithmetic)
     losses = cross_entropy(q.reshape(2, m, 2), targets(pairs.label))  # [critic, pair]
     return numbers.weight * jnp.sum(losses @ pairs.weight) / jnp.maximum(pairs.weight.sum(), 1)
 
@@ -76,15 +76,12 @@ def outer_step(
     key: PRNGKeyArray,
     numbers: OuterNumbers,
     separate: bool,
-    activation: Activation = jax.nn.relu,
+    arithmetic: Arithmetic = sac.FLOAT32,
 ) -> tuple[RewardModel, dict[str, Array]]:
-    """One Adam step of the reward model on the outer loss; ``separate``: with an Adam of its own.
-
-    activation: of the critics' hidden layers.
-    """
-    next_value = jax.lax.stop_gradient(sac.next_value(agent, batch, key, activation))
+    """One Adam step of the reward model on the outer loss; ``separate``: with an Adam of its own."""
+    next_value = jax.lax.stop_gradient(sac.next_value(agent, batch, key, arithmetic))
     loss, gradient = jax.value_and_grad(outer_loss)(
-        model.members, agent.critics, batch, next_value, pairs, numbers, model.scaling, activation
+        model.members, agent.critics, batch, next_value, pairs, numbers, model.scaling, arithmetic
     )
     state = model.outer_adam if separate else model.adam
     members, state = descend(model.members, gradient, state, numbers.rate)
