@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from senior import envs, program
+from senior import envs, judgement, program
 from senior.cli import BAD_INPUT, COMMANDS, DONE, FAILED, main
 from senior.config import Answering, Config, to_json
 from senior.methods import METHODS
@@ -419,7 +419,7 @@ def test_a_run_that_broke_is_told_and_ends_with_code_1(capsys: pytest.CaptureFix
         program.Result(Path("runs/arm/seed-1"), 1, 649, False, "The environment arm failed: motor burnt", 20, None),
     ]
     monkeypatch.setattr(program, "train", lambda *_, **_options: results)
-    monkeypatch.setattr(program, "film_policy", lambda *_: "There is no video: arm draws nothing.")
+    monkeypatch.setattr(judgement, "film_policy", lambda *_: "There is no video: arm draws nothing.")
     assert main(["train", "--seeds", "2"]) == FAILED
     told = capsys.readouterr().out
     assert "seed 0: runs/arm/seed-0\n  success rate   not told by the environment" in told

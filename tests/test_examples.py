@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from senior.program import Judgement
+from senior.judgement import Judgement
 from tests.small import rows
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

@@ -13,7 +13,8 @@ from senior.checkpoint import steps, unpack
 from senior.config import Config
 from senior.envs.episodes import AFTERWARDS, EVALUATION, TRAINING, episode_seed
 from senior.envs.point import Point
-from senior.program import Quiet, Result, evaluate_run, resume, train
+from senior.judgement import evaluate_run
+from senior.program import Quiet, Result, resume, train
 from senior.types import BadInput
 from tests.equal import assert_same_run, progress_of
 from tests.small import rows, small

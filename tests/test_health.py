@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from senior import health, loop
+from senior import health, loop, session
 from senior.program import Quiet, make_learner, spec_of
 from senior.runs import Runs
 from senior.trainee import Trainee
@@ -115,8 +116,8 @@ def test_a_warning_is_told_once_per_run_and_kind_and_kept(tmp_path: Path):
 def test_a_session_without_episodes_is_told(tmp_path: Path):
     training, said = two_runs(tmp_path)
     training.trainees[0].progress.recent = [[0, 0, 50]]
-    training.session(0, 400, 10)
-    training.session(0, 400, 10)
+    for _ in range(2):
+        assert not session.hold(training.trainees[0], training.runs, 0, 400, 10, partial(training.warn, 0))
     (sentence,) = said.sentences
     assert "session at step 400 is put off" in sentence
     assert training.trainees[0].progress.queried == 0

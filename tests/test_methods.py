@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from senior.config import Answering, Bilevel, Evaluation, Pretraining
+from senior.judgement import evaluate_run
 from senior.methods import METHODS
 from senior.preferences import Preferences
-from senior.program import evaluate_run, train
+from senior.program import train
 from senior.rundir import EVAL, TRAIN
 from senior.schedule import plan
 from tests.equal import progress_of

@@ -20,8 +20,9 @@ from senior import cli
 from senior.checkpoint import steps
 from senior.config import Answering, Config, load
 from senior.envs.point import Point
+from senior.judgement import load_policy
 from senior.presets import release
-from senior.program import Quiet, load_policy, resume, train
+from senior.program import Quiet, resume, train
 from senior.schedule import plan
 from senior.trainee import Trainee
 from senior.types import BadInput

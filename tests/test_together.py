@@ -10,10 +10,11 @@ import pytest
 
 from senior import program
 from senior.config import Config
-from senior.learner import Learner, shape
+from senior.learner import Learner
 from senior.methods import METHODS
 from senior.presets import preset, release
 from senior.program import Quiet, make_learner, resume, train_all
+from senior.shape import shape
 from senior.types import BadInput
 from tests.equal import assert_same_run, short
 from tests.small import rows, small

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from senior.config import Config
+    from senior.judgement import Judgement, evaluate_run
     from senior.loop import Watcher
     from senior.methods import METHODS, Method
     from senior.presets import preset, release, with_budget
-    from senior.program import Judgement, Quiet, Result, evaluate_run, resume, train, train_all
+    from senior.program import Quiet, Result, resume, train, train_all
     from senior.schedule import plan
     from senior.select import Context, Selection
     from senior.types import Answers, BadInput, EnvSpec, Pairs, Query
@@ -29,7 +30,7 @@ _HOME = {
     "Config": "config",
     "Context": "select",
     "EnvSpec": "types",
-    "Judgement": "program",
+    "Judgement": "judgement",
     "Method": "methods",
     "Pairs": "types",
     "Query": "types",
@@ -37,7 +38,7 @@ _HOME = {
     "Result": "program",
     "Selection": "select",
     "Watcher": "loop",
-    "evaluate_run": "program",
+    "evaluate_run": "judgement",
     "plan": "schedule",
     "preset": "presets",
     "release": "presets",

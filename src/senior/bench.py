@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from senior import program, rundir
+from senior import program, rundir, session
 from senior.checks import check
 from senior.config import Config, Pretraining
 from senior.learner import Learner
@@ -154,7 +154,7 @@ def measure(config: Config, runs: int, device: str, length: int, out: Path) -> d
         spent = []
         for i in range(2):
             began = time.perf_counter()
-            training.session(0, step + i, n)
+            session.hold(trainees[0], states, 0, step + i, n, lambda kind, sentence: None)
             training.wait()
             spent.append(time.perf_counter() - began)
         figures["session_seconds"] = spent[-1]

@@ -208,7 +208,7 @@ def _resume(arguments: list[str]) -> int:
 
 def _report(results: Sequence[Any], display: Display) -> int:
     """Say what came of the runs and where their files are."""
-    from senior import program
+    from senior import judgement
 
     for result in results:
         print(f"\n{result.path}" if result.seed is None else f"\nseed {result.seed}: {result.path}")
@@ -223,7 +223,7 @@ def _report(results: Sequence[Any], display: Display) -> int:
             print(f"  success rate   {success} in the last evaluation; labels used: {result.labels}")
             print(f"  learning curve {result.path / 'plots' / 'learning-curve.png'}")
             video = result.path / "videos" / "final.mp4"
-            reason = program.film_policy(result.path, video)
+            reason = judgement.film_policy(result.path, video)
             print(f"  video          {reason or video}")
     if any(result.failure for result in results):
         return FAILED
@@ -232,13 +232,13 @@ def _report(results: Sequence[Any], display: Display) -> int:
 
 def _eval(arguments: list[str]) -> int:
     options = parse(EvalOptions, arguments, None, "eval")
-    from senior import program
+    from senior import judgement, program
 
     found = program.find_runs(options.run)
     if options.video and len(found) > 1:
         raise BadInput(f"--video films one run, and there are {len(found)} under {options.run}; name one of them.")
     for path in found:
-        judged = program.evaluate_run(path, options.episodes, options.video)
+        judged = judgement.evaluate_run(path, options.episodes, options.video)
         success = "not told" if judged.success_rate is None else f"{judged.success_rate:.3f}"
         print(
             f"{path}: policy of step {judged.step}, {judged.episodes} fresh episodes: success rate {success}, "

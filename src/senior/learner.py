@@ -7,7 +7,6 @@ Every function takes the state of one run first and returns ``(state, result)``;
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -23,6 +22,7 @@ from senior.config import Config
 from senior.explore import Bonus, Now, preference_guided, state_entropy
 from senior.replay import Fact, Replay
 from senior.reward import bilevel, model
+from senior.shape import Numbers, numbers_of, shape
 from senior.types import Batch, EnvSpec, Source
 
 
@@ -44,17 +44,6 @@ class Purpose(IntEnum):
     TEACHER = 12  # senior.teachers.scripted.RANDOM
 
 
-class Numbers(NamedTuple):
-    """Numeric hyper-parameters of one run, traced."""
-
-    sac: sac.Numbers
-    fit: model.FitNumbers
-    outer: bilevel.OuterNumbers
-    until: Int[Array, ""]
-    steps: Int[Array, ""]
-    rate_end: Float[Array, ""]
-
-
 class Run(NamedTuple):
     """Everything of one run that changes while it learns and lives on the device."""
 
@@ -68,56 +57,6 @@ class Run(NamedTuple):
     bonus: Any
     length_scale: Float[Array, ""]
     learned_return: Float[Array, ""]  # learned reward summed over the running episode
-
-
-def numbers_of(config: Config) -> Numbers:
-    """The traced numbers of a configuration."""
-    values = Numbers(
-        sac.Numbers(
-            config.sac.actor_rate,
-            config.sac.critic_rate,
-            config.sac.alpha_rate,
-            config.sac.discount,
-            config.sac.tau,
-            config.sac.target_entropy,
-        ),
-        model.FitNumbers(config.reward.rate, config.reward.epochs, config.reward.stop_accuracy),
-        bilevel.OuterNumbers(config.sac.critic_rate, config.reward.rate, config.bilevel.weight, config.sac.discount),
-        until=jnp.int32(config.pretraining.until),
-        steps=jnp.int32(config.steps),
-        rate_end=jnp.float32(config.sac.rate_end),
-    )
-    return jax.tree.map(jnp.asarray, values)
-
-
-def shape(config: Config) -> Config:
-    """What of a configuration the traced functions are made from: runs that agree in it can share one program.
-
-    The rest, here at its defaults, is in `Numbers`, or the host's matter: seed, task, schedule, questions, teacher.
-    """
-    plain, method, reward = Config(), config.method, Config().reward
-    kept = replace(method, name="", select="uniform" if method.learns_reward else "none", outer="none")
-    return Config(
-        method=kept,
-        steps=config.capacity,
-        queries=replace(plain.queries, segment=config.queries.segment),
-        pretraining=config.pretraining,
-        networks=config.networks,
-        sac=replace(
-            plain.sac,
-            batch=config.sac.batch,
-            target_every=config.sac.target_every,
-            updates=config.sac.updates,
-            reset_updates=config.sac.reset_updates,
-        ),
-        reward=replace(config.reward, rate=reward.rate, epochs=reward.epochs, stop_accuracy=reward.stop_accuracy),
-        pge=replace(config.pge, every=plain.pge.every, equal=plain.pge.equal, refresh_with_outer=True),
-        bilevel=replace(plain.bilevel, optimizer=config.bilevel.optimizer, batch=config.bilevel.batch),
-        rune=config.rune,
-        qpa=replace(plain.qpa, share=config.qpa.share),
-        device=config.device,
-        precision=config.precision,
-    )
 
 
 class Learner:

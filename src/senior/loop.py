@@ -13,21 +13,20 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Protocol
 
 import jax
 import numpy as np
 
-from senior import health, parts
+from senior import health, session
 from senior.envs.episodes import Episodes, Failure, Step
 from senior.evaluate import judge, summary
 from senior.learner import Purpose, act, acting, actor_of, mean_action
 from senior.replay import Fact
 from senior.runs import PerRun, Proposal, Runs
 from senior.schedule import Due, due
-from senior.select import Context, probability_second
 from senior.trainee import Trainee
-from senior.types import Pairs, Preferred, Query
 
 
 class Watcher(Protocol):
@@ -77,7 +76,7 @@ class Clock:
 
 
 class Training:
-    """R runs of one `senior.learner.shape` that advance together."""
+    """R runs of one `senior.shape` that advance together."""
 
     def __init__(self, trainees: Sequence[Trainee], runs: Runs, watcher: Watcher) -> None:
         self.trainees = list(trainees)
@@ -200,8 +199,9 @@ class Training:
             self.runs.one(i, learner.measure)
             progress.measured = True
         if plan.session:
-            self.session(i, step, plan.session)
-            if trainee.failure:
+            refused = session.hold(trainee, self.runs, i, step, plan.session, partial(self.warn, i))
+            if refused:
+                self.fail(i, step, refused)
                 return
         if plan.outer and progress.labels:
             info = self.runs.one(i, learner.outer, trainee.latest_pairs(), at)
@@ -213,86 +213,6 @@ class Training:
         if plan.begin:
             self.runs.one(i, learner.begin, at)
             progress.updates += trainee.config.sac.reset_updates
-
-    def session(self, i: int, step: int, n: int) -> None:
-        """Select pairs, ask, and learn from the answers."""
-        trainee, runs = self.trainees[i], self.runs
-        learner, progress, preferences = trainee.learner, trainee.progress, trainee.preferences
-        drawn = trainee.candidate_starts(step)
-        if drawn is None:
-            self.warn(
-                i,
-                f"session at {step}",
-                f"The session at step {step} is put off: fewer than two complete episodes are longer than a segment "
-                f"of {trainee.config.queries.segment} steps.",
-            )
-            return
-        starts, episodes, first_steps = drawn
-        observation, action, reward = (np.asarray(column) for column in runs.one(i, learner.cut, starts))
-        pool = Pairs(observation, action, reward, episodes, first_steps)
-        length_scale = float(runs.view(i, lambda run: run.length_scale))
-        variance = pool.observation[..., trainee.spec.position].var(axis=-2).max()
-        self.warn(i, "motion", health.nothing_moves(float(variance), length_scale))
-
-        def predict(observation: np.ndarray, action: np.ndarray) -> np.ndarray:
-            return np.asarray(runs.one(i, learner.summed_rewards, observation, action))
-
-        informed = progress.labels > 0
-        rule = trainee.rule if informed and trainee.rule else parts.first_selection()
-        labelled = preferences.arrays.observation[: progress.labels]
-        context = Context(pool, predict, trainee.spec, length_scale, labelled)
-        chosen = rule(trainee.rng(Purpose.SELECT, step), context, n)
-        before = predict(pool.observation, pool.action).mean(axis=0)[chosen.index]
-        asked = pool.take(chosen.index)
-        query = Query(asked, chosen.scores, probability_second(before), trainee.reward_per_step())
-
-        sides = trainee.rng(Purpose.SIDES, step).integers(2, size=n)
-        ids = preferences.add(query, progress.sessions, step, trainee.config.seed, sides)
-        trainee.teacher.ask(ids, query)
-        answers = trainee.teacher.collect()
-        if sorted(answers.ids) != ids or not set(answers.labels) <= {None, *map(int, Preferred)}:
-            preferences.truncate(ids[0] - 1)
-            self.fail(
-                i,
-                step,
-                f"The teacher {trainee.config.teacher} must answer every pair at once, by first (0), "
-                "second (1), equal (-1) or a skip (None).",
-            )
-            return
-        preferences.answer(answers, trainee.config.teacher, step)
-        progress.sessions += 1
-        progress.queried += n
-        progress.labels = preferences.arrays.count
-
-        said = dict(zip(answers.ids, answers.labels, strict=True))
-        self.judge_predictions(i, query, [said[number] for number in ids], informed)
-        if not progress.labels:
-            return
-        at = np.int32(step)
-        info = runs.one(i, learner.fit, trainee.labelled(), at)
-        progress.latest.update({name: float(value) for name, value in info.items()})
-        positions, count = preferences.preferred_positions(trainee.spec.position, trainee.config.pge.equal)
-        runs.one(i, learner.on_session, positions, np.int32(count), at)
-
-    def judge_predictions(self, i: int, query: Query, labels: Sequence[int | None], informed: bool) -> None:
-        """Prospective accuracy: the model's prediction of new pairs before it is fitted to them.
-
-        ``informed``: it had been fitted to some before.
-        """
-        progress = self.trainees[i].progress
-        assert query.prediction is not None
-        decided = [
-            (probability > 0.5) == (label == Preferred.SECOND)
-            for probability, label in zip(query.prediction, labels, strict=True)
-            if label in (Preferred.FIRST, Preferred.SECOND)
-        ]
-        if not decided:
-            return
-        progress.latest["reward_accuracy"] = sum(decided) / len(decided)
-        if informed:
-            progress.right.append(int(sum(decided)))
-            progress.decided.append(len(decided))
-            self.warn(i, "accuracy", health.accuracy_at_chance(progress.right, progress.decided))
 
     # Looking back: evaluation, snapshots, checkpoints.
 

@@ -11,23 +11,18 @@ from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from senior import checkpoint, evaluate, parts, rundir
-from senior.agent.networks import MLP
-from senior.checkpoint import Damaged, unpack
+from senior import checkpoint, parts, rundir
 from senior.checks import check
 from senior.config import Config, load
-from senior.envs import render
-from senior.envs.episodes import AFTERWARDS, Failure, episode_seed
 from senior.envs.workers import Workers
-from senior.learner import Learner, Run, mean_action, shape
+from senior.learner import Learner, Run
 from senior.loop import Training, Watcher
 from senior.report.curves import learning_curve
 from senior.runs import Lift, Runs, device_memory, lift_for, prepare_device, state_bytes
-from senior.trainee import Trainee, make_environment, make_place
+from senior.shape import shape
+from senior.trainee import Trainee, make_environment
 from senior.types import BadInput, EnvSpec
 
 
@@ -89,7 +84,7 @@ def train_all(
 ) -> list[Result]:
     """Train runs of any configurations, each in its directory, on one device.
 
-    Runs whose configurations have one `senior.learner.shape` share one program: they may differ in seed, task,
+    Runs whose configurations have one `senior.shape` share one program: they may differ in seed, task,
     schedule, teacher and numbers. Programs of different shapes go side by side on a GPU, one after the other on a CPU.
     A run's result does not depend on the runs beside it.
 
@@ -191,101 +186,6 @@ def resume(
 def _unopened(directory: Path, error: BadInput, watcher: Watcher) -> Result:
     watcher.say(f"{directory}: {error}")
     return Result(directory, None, 0, False, str(error), 0, None)
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """`evaluate_run`'s finding."""
-
-    episodes: int
-    success_rate: float | None
-    """In [0, 1]: episodes with success at any step. None if the environment tells no success."""
-    return_mean: float
-    """True return, a sum over an episode."""
-    return_std: float
-    """Its population standard deviation."""
-    step: int
-    """When the policy was saved."""
-    video: Path | None
-    no_video: str | None
-    """Why there is no video, in a sentence."""
-
-
-def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None = None) -> Judgement:
-    """Judge a run's policy, as last saved, on fresh episodes that training never saw; film the first one if asked.
-
-    Raises `BadInput` if there is no such run or no policy yet, ``video`` cannot be written, or the environment fails.
-    """
-    if episodes < 1:
-        raise BadInput(f"--episodes must be at least 1, not {episodes}.")
-    path = Path(path)
-    config = load(path / "config.json")
-    if video is not None:
-        rundir.make_room(Path(video))
-    prepare_device("auto")
-    step, actor = load_policy(path)
-    policy = jax.jit(mean_action)
-    place = make_place(config, AFTERWARDS)
-    try:
-        judged = evaluate.judge(lambda seen: {0: np.asarray(policy(actor, seen[0]))}, {0: place}, {0: range(episodes)})[
-            0
-        ]
-    finally:
-        place.close()
-    if isinstance(judged, Failure):
-        raise BadInput(judged.message)
-    summary = evaluate.summary(judged)
-    reason = None
-    if video is not None:
-        reason = film(config, AFTERWARDS, 0, judged[0].actions, Path(video))
-    return Judgement(
-        episodes,
-        summary["success_rate"],
-        float(summary["return_mean"] or 0),
-        float(summary["return_std"] or 0),
-        step,
-        None if video is None or reason else Path(video),
-        reason,
-    )
-
-
-def film_policy(path: Path, out: Path) -> str | None:
-    """Film one fresh episode of a run's policy; None, or the sentence why there is no video."""
-    try:
-        return evaluate_run(path, episodes=1, video=out).no_video
-    except BadInput as error:
-        return str(error)
-
-
-def load_policy(path: Path) -> tuple[int, MLP]:
-    """The step and the actor of a run's saved policy."""
-    file = path / "policy" / "actor.npz"
-    if not file.exists():
-        raise BadInput(f"{path} holds no policy yet: the run has not reached its first checkpoint.")
-    try:
-        saved = unpack(file)
-        layers = sum(name.startswith("weight_") for name in saved)
-        actor = MLP(
-            tuple(jnp.asarray(saved[f"weight_{i}"]) for i in range(layers)),
-            tuple(jnp.asarray(saved[f"bias_{i}"]) for i in range(layers)),
-        )
-        return int(saved["step"]), actor
-    except (Damaged, KeyError) as error:
-        raise BadInput(f"The policy of {path} cannot be read: {error}.") from error
-
-
-def film(config: Config, purpose: int, episode: int, actions: np.ndarray, out: Path) -> str | None:
-    """Write an episode as MP4 by living through it again; None, or the sentence why there is no video."""
-    request = render.Request(
-        task=None if config.env else config.task,
-        seed=episode_seed(config.seed, purpose, episode),
-        actions=actions,
-        env=config.env,
-        position=config.position,
-        length_scale=config.length_scale,
-        horizon=config.horizon,
-    )
-    return render.record(request, out)
 
 
 def find_runs(path: Path | str) -> list[Path]:
