@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import pytest
 
-from senior import program
+from senior import learner, parts, program
+from senior.checkpoint import steps
 from senior.config import Config
 from senior.learner import Learner
 from senior.methods import METHODS
 from senior.presets import preset, release
 from senior.program import Quiet, make_learner, resume, train_all
+from senior.replay import Fact
+from senior.reward.bilevel import FirstSteps
+from senior.reward.model import Labelled
 from senior.shape import shape
 from senior.types import BadInput
 from tests.equal import assert_same_run, short
@@ -97,31 +104,70 @@ class Spied:
     __hash__ = None  # pyright: ignore[reportAssignmentType]
 
 
+def everything() -> Config:
+    """RUNE's bonus with normalised layers and standardised observations."""
+    run = small("m-rune", steps=700)
+    networks, reward = replace(run.networks, layer_norm=True), replace(run.reward, standardise=True)
+    return replace(run, networks=networks, reward=reward)
+
+
 @pytest.mark.parametrize(
     "config",
-    [short(steps=700), small("qpa", steps=700), release(short(steps=700, replay_capacity=None))],
-    ids=["senior", "qpa", "release"],
+    [short(steps=700), small("qpa", steps=700), release(short(steps=700, replay_capacity=None)), everything()],
+    ids=["senior", "qpa", "release", "rune"],
 )
-def test_traced_functions_read_nothing_that_a_shape_leaves_out(
-    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def trace(tutor: Learner, config: Config) -> None:
+    """Trace every function of a learner, without compiling any."""
+
+    def array(*size: int, kind: type = np.float32) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(size, kind)
+
+    step, whole = array(kind=np.int32), (config.queries.budget, 2, config.queries.segment)
+    flag, pairs = array(kind=np.bool_), array(whole[0], kind=np.int32)
+    fact = Fact(array(4), array(2), array(), array(4), flag, flag, step)
+    labelled = Labelled(array(*whole, 4), array(*whole, 2), pairs, step)
+    first_steps = FirstSteps(array(whole[0], 2, 4), array(whole[0], 2, 2), pairs, array(whole[0]))
+    run = jax.eval_shape(lambda: tutor.init(config))
+    calls: list[tuple[Any, ...]] = [
+        (tutor.store, fact),
+        (tutor.store_pretraining, fact),
+        (tutor.pretrain, step),
+        (tutor.learn, step, step),
+        (tutor.begin, step),
+        (tutor.cut, array(6, 2, kind=np.int32)),
+        (tutor.summed_rewards, array(*whole, 4), array(*whole, 2)),
+        (tutor.fit, labelled, step),
+        (tutor.on_session, array(20, 2), step, step),
+        (tutor.refresh, step),
+        (tutor.outer, first_steps, step),
+        (tutor.measure,),
+        (tutor.relabel,),
+    ]
+    for function, *arguments in calls:
+        jax.eval_shape(function, run, *arguments)
+    public = {name for name in vars(Learner) if not name.startswith("_")} - {"init"}
+    assert {function.__name__ for function, *_ in calls} == public
+
+
+@pytest.mark.parametrize(
+    "config",
+    [short(), small("qpa"), release(short(replay_capacity=None)), everything()],
+    ids=["senior", "qpa", "release", "rune"],
+)
+def test_traced_functions_read_nothing_that_a_shape_leaves_out(config: Config, monkeypatch: pytest.MonkeyPatch):
     one, two = leaves(shape(config)), leaves(shape(changed(config)))
     left_out = {name for name in one if one[name] == two[name]} - {"method.select", "replay_capacity"}
     assert {"seed", "task", "sac.critic_rate", "queries.budget", "mds.keep", "evaluation.every"} <= left_out
     assert not {"sac.batch", "queries.segment", "pge.share", "qpa.share", "networks.width"} & left_out
 
     read: set[str] = set()
-    make = program.make_learner
-
-    def spied(config: Config) -> Learner:
-        learner = make(replace(config, networks=replace(config.networks, width=24)))  # one of our own
-        learner.config = Spied(learner.config, read)  # pyright: ignore[reportAttributeAccessIssue]
-        return learner
-
-    monkeypatch.setattr(program, "make_learner", spied)
-    program.train(replace(config, networks=replace(config.networks, width=24)), tmp_path)
-    program._learner.cache_clear()
-    assert {"sac.batch", "networks.width", "queries.segment"} <= read
+    seen: Any = Spied(config, read)
+    spec = program.spec_of(config)
+    monkeypatch.setattr(learner, "shape", lambda config: config if isinstance(config, Spied) else Spied(config, read))
+    trace(Learner(seen, spec, parts.bonus(seen, spec)), config)
+    expected = {"sac.batch", "networks.width", "queries.segment", "networks.layer_norm", "method.explore", "precision"}
+    assert expected <= read
+    read -= {"seed", "sac.initial_alpha"}  # which `init` hands on as numbers
     assert not read & left_out
 
 
@@ -142,6 +188,27 @@ def test_under_vmap_a_run_depends_neither_on_its_neighbour_nor_on_the_program_be
     assert all(result.finished for result in train_all(first, Said(), lift="vmap"))
     train_all([(short(), tmp_path / "two" / "a"), (short(seed=3), tmp_path / "two" / "b")], Said(), lift="vmap")
     assert_same_run(tmp_path / "one" / "a", tmp_path / "two" / "a", interrupted=False)
+
+
+def test_programs_side_by_side_have_workers_of_their_own(tmp_path: Path):
+    runs = [(short(steps=500), tmp_path / "a"), (small("sac", steps=500), tmp_path / "b")]
+    assert all(result.finished for result in train_all(runs, Said(), lift="vmap", workers=1))
+
+
+class Breaks(Said):
+    """Raises at a step of plain SAC, as a full disk does."""
+
+    def advance(self, step: int, trainees: Any) -> None:
+        if step == 50 and trainees[0].config.method.name == "sac":
+            raise OSError("No space left on device")
+        time.sleep(0.001)
+
+
+def test_an_error_in_one_program_ends_those_beside_it_with_all_saved(tmp_path: Path):
+    runs = [(small("sac", steps=5000), tmp_path / "a"), (small("pebble", steps=100_000), tmp_path / "b")]
+    with pytest.raises(OSError, match="No space"):
+        train_all(runs, Breaks(), lift="vmap")
+    assert 0 < steps(tmp_path / "b" / "checkpoints")[0] < 50_000
 
 
 def test_programs_one_after_the_other_do_not_disturb_each_other(tmp_path: Path):
@@ -172,6 +239,21 @@ def test_as_many_at_a_time_as_asked_for_and_the_rest_afterwards(tmp_path: Path):
     assert len(told) == 1 and "; 2 of 3 runs at a time, " in told[0]
     (alone,) = train_all([(short(seed=2), tmp_path / "alone")], Said())
     assert_same_run(alone.path, results[2].path, interrupted=False)
+
+
+def test_as_many_at_a_time_as_the_memory_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    size = program.state_bytes(make_learner(short()), short())
+    monkeypatch.setattr(program, "device_memory", lambda device: 2.5 * size)  # nine tenths of it hold two
+    said = Said(stop=True)
+    train_all([(short(seed=seed), tmp_path / f"seed-{seed}") for seed in range(3)], said)
+    assert f"A run keeps {size / 1e9:.2g} GB; 2 of 3 runs at a time, {2 * size / 1e9:.2g} GB." in said.sentences[0]
+
+
+def test_what_is_told_of_runs_that_are_not_reached_is_where_they_stand(tmp_path: Path):
+    train_all([(short(), tmp_path / "a"), (short(seed=1), tmp_path / "b")], Said())
+    first, second = resume(tmp_path, Said(stop=True), runs_per_device=1)
+    assert (first.step, first.labels) == (second.step, second.labels) == (1000, 25)
+    assert second.finished and second.success_rate is not None
 
 
 def test_runs_that_were_not_begun_can_be_resumed(tmp_path: Path):

@@ -42,6 +42,9 @@ class Treacherous(Point):
                 case "hang once":
                     order.unlink()
                     time.sleep(3600)
+                case "die once":
+                    order.unlink()
+                    os._exit(7)
                 case "nan":
                     return np.full(4, np.nan, np.float32), 0.0, False, False, {"success": 0.0}
         return super().step(action)
@@ -159,6 +162,39 @@ def test_an_environment_that_kills_its_worker_again_and_again_is_given_up(pool: 
     assert_same(go(beside, action), go(local, action))
     assert remote.begin(1) is None
     assert isinstance(go(remote, action), Step)
+
+
+def test_a_worker_lost_while_another_brings_the_environment_back_is_replaced_too(pool: Workers, treachery: Path):
+    remote, local = pair(pool, made_by("Treacherous"), 3)
+    rng = np.random.default_rng(0)
+    for place in (remote, local):
+        place.begin(0)
+    for step in range(9):
+        action = rng.uniform(-1, 1, 2).astype(np.float32)
+        if step == 4:
+            treachery.write_text("die once")  # at step 3, which is lived through again
+            remote._worker.process.kill()
+        assert_same(go(remote, action), go(local, action))
+    assert not treachery.exists()
+    assert len(remote.notes) == 2
+
+
+def test_an_answer_nobody_asked_for_is_not_taken_for_the_next(pool: Workers, treachery: Path):
+    remote, local = pair(pool, made_by("Treacherous"), 3)
+    remote.begin(0)
+    remote.send(np.ones(2, np.float32))
+    assert (remote.begin(1), local.begin(1)) == (None, None)
+    np.testing.assert_array_equal(remote.observation, local.observation)
+    assert_same(go(remote, np.ones(2, np.float32)), go(local, np.ones(2, np.float32)))
+
+
+def test_an_environment_that_cannot_be_built_there_is_told(pool: Workers):
+    _, local = pair(pool, made_by("Treacherous"), 3)
+    remote = Remote(pool.next(), {**made_by("Treacherous"), "env": "nowhere:Robot"}, local.spec, 3, TRAINING)
+    failure = remote.begin(0)
+    assert failure is not None
+    assert f"The environment {HERE}:Treacherous of seed 3 failed in episode 0 after step 0: BadInput" in failure.message
+    assert remote.begin(1) == remote.begin(1) != failure  # the worker lives
 
 
 def test_what_an_environment_does_wrong_is_told_as_in_this_process(pool: Workers, treachery: Path):

@@ -115,14 +115,17 @@ def hastened(config: Config) -> Config:
     )
 
 
-def measure(config: Config, runs: int, device: str, length: int, out: Path) -> dict[str, Any]:
+def measure(config: Config, runs: int, device: str, length: int, out: Path, pools: program.Pools) -> dict[str, Any]:
     """Figures of one method; ``length`` main-phase steps are timed twice, with and without waiting per part."""
     config = hastened(config)
     learns = config.method.learns_reward
     start = max(config.pretraining.until, config.pretraining.random_steps) + WARM_UP
     began = time.perf_counter()
-    learner, spec = program.make_learner(config), program.spec_of(config)
-    trainees = [Trainee(replace(config, seed=i), out / f"seed-{i}", learner, spec) for i in range(runs)]
+    spec = program.spec_of(config)
+    learner = program.make_learner(config, spec)
+    trainees = [
+        Trainee(replace(config, seed=i), out / f"seed-{i}", learner, spec, pools.worker(learner)) for i in range(runs)
+    ]
     for trainee in trainees:
         trainee.reset(0)
         trainee.directory.create(trainee.config, {})
@@ -207,8 +210,8 @@ def run(
     )
     found = []
     for config, count in ((config, count) for config in configs for count in runs):
-        with tempfile.TemporaryDirectory() as folder:
-            figures = measure(config, count, device, steps, Path(folder))
+        with tempfile.TemporaryDirectory() as folder, program.Pools(None, device, count) as pools:
+            figures = measure(config, count, device, steps, Path(folder), pools)
         found.append(figures)
         missing = float("nan")
         ms = figures["milliseconds"]

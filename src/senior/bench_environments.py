@@ -6,7 +6,6 @@ All three take the same actions through whole episodes, resets included, in turn
 from __future__ import annotations
 
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -98,5 +97,4 @@ def run(task: str, count: int) -> dict[str, Any]:
         ("workers", f"ours, in {figures['processes']} worker processes"),
     ):
         print(f"  {rates[name]:8.0f}  {rates[name] / rates['sync_vector_env']:5.2f}x  {told}", flush=True)
-    sys.stdout.flush()
     return figures

@@ -7,6 +7,7 @@ serves. Nothing is pickled.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -130,6 +131,14 @@ def restore(directory: Path, step: int, template: Run) -> tuple[Run, dict[str, A
     except (KeyError, ValueError, TypeError) as error:
         raise Damaged(f"{path.name} is damaged ({error})") from error
     return run, about["progress"]
+
+
+def standing(directory: Path) -> dict[str, Any] | None:
+    """The progress in the newest checkpoint that can be read, without the rest of it; None if there is none."""
+    for step in steps(directory):
+        with contextlib.suppress(Damaged, KeyError, ValueError):
+            return json.loads(unpack(directory / f"step-{step:010d}.npz")["about"].tobytes())["progress"]
+    return None
 
 
 def newest(

@@ -14,10 +14,10 @@ from senior.agent.networks import MLP
 from senior.checkpoint import Damaged, unpack
 from senior.config import Config, load
 from senior.envs import render
-from senior.envs.episodes import AFTERWARDS, Failure, episode_seed
+from senior.envs.episodes import AFTERWARDS, Failure, Local, episode_seed
 from senior.learner import mean_action
 from senior.runs import prepare_device
-from senior.trainee import make_place
+from senior.trainee import make_environment
 from senior.types import BadInput
 
 
@@ -53,11 +53,10 @@ def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None 
     prepare_device("auto")
     step, actor = load_policy(path)
     policy = jax.jit(mean_action)
-    place = make_place(config, AFTERWARDS)
+    place = Local(lambda: make_environment(config), config.seed, AFTERWARDS)
     try:
-        judged = evaluate.judge(lambda seen: {0: np.asarray(policy(actor, seen[0]))}, {0: place}, {0: range(episodes)})[
-            0
-        ]
+        episodes_of = {0: range(episodes)}
+        judged = evaluate.judge(lambda seen: {0: np.asarray(policy(actor, seen[0]))}, {0: place}, episodes_of)[0]
     finally:
         place.close()
     if isinstance(judged, Failure):

@@ -47,13 +47,13 @@ class Watcher(Protocol):
 
 
 class Clock:
-    """Seconds per part of the loop since the last row of timing.csv."""
+    """Seconds per part of the loop, of all its runs together."""
 
     def __init__(self, start: int) -> None:
         self.spent: dict[str, float] = defaultdict(float)
-        self.started = self.last = time.perf_counter()
-        self.last_step = start
-        self.latest: dict[str, float] = {}
+        self.started = time.perf_counter()
+        self.start = start
+        self._told: dict[int, tuple[int, float, dict[str, float]]] = {}  # per run: step, time and parts of its last row
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
@@ -63,16 +63,14 @@ class Clock:
         finally:
             self.spent[name] += time.perf_counter() - began
 
-    def row(self, step: int) -> dict[str, float]:
-        """The parts since the last row, and the rate at which all runs together advanced; the same for every run."""
-        if step == self.last_step and self.latest:
-            return self.latest
+    def row(self, run: int, step: int) -> dict[str, float]:
+        """A row of timing.csv: the parts since the run's last one, and the rate at which it advanced."""
         now = time.perf_counter()
-        rate = (step - self.last_step) / (now - self.last)
-        row = {"step": step, "seconds": now - self.started, "steps_per_second": rate, **self.spent}
-        self.spent.clear()
-        self.last, self.last_step, self.latest = now, step, row
-        return row
+        last_step, last, before = self._told.get(run, (self.start, self.started, {}))
+        self._told[run] = step, now, dict(self.spent)
+        rate = (step - last_step) / (now - last)
+        parts = {name: seconds - before.get(name, 0.0) for name, seconds in self.spent.items()}
+        return {"step": step, "seconds": now - self.started, "steps_per_second": rate, **parts}
 
 
 class Training:
@@ -232,7 +230,7 @@ class Training:
             config, progress = trainee.config, trainee.progress
             at_end = step == config.steps
             if i in judged:
-                trainee.directory.append("timing.csv", self.clock.row(step))
+                trainee.directory.append("timing.csv", self.clock.row(i, step))
             if step > progress.snapped and (step % config.snapshot_every == 0 or at_end):
                 self.snapshot(i, step)
                 progress.snapped = step

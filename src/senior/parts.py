@@ -53,7 +53,7 @@ def bonus(config: Config, spec: EnvSpec) -> Bonus:
         case "preference_guided":
             return make(spec, pge.capacity, pge.bandwidth, pge.beta, pge.decay, pge.clock)
         case "disagreement":
-            return make(spec, **asdict(config.rune))
+            return make(spec, config.rune.beta, config.rune.decay)
     return make(spec)
 
 

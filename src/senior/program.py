@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 
 from senior import checkpoint, parts, rundir
 from senior.checks import check
 from senior.config import Config, load
-from senior.envs.workers import Workers
+from senior.envs.workers import Worker, Workers
 from senior.learner import Learner, Run
 from senior.loop import Training, Watcher
 from senior.report.curves import learning_curve
@@ -86,7 +87,7 @@ def train_all(
 
     Runs whose configurations have one `senior.shape` share one program: they may differ in seed, task,
     schedule, teacher and numbers. Programs of different shapes go side by side on a GPU, one after the other on a CPU.
-    A run's result does not depend on the runs beside it.
+    A run's result does not depend on what the runs beside it do; under ``vmap`` its last bits do on how many they are.
 
     watcher: who is told of every step and of warnings, and can stop the runs, all saved; None prints warnings.
     lift: how runs share a program, ``loop`` or ``vmap``; None takes what suits the device.
@@ -94,8 +95,9 @@ def train_all(
         but not more than runs, and 0 on a CPU.
     runs_per_device: how many are trained at a time; None: as many as the memory holds.
 
-    Returns one `Result` per run, in order. Raises `BadInput` before anything is written if a configuration makes no
-    sense, an environment does not fit, or a directory is not empty.
+    Returns one `Result` per run, in order; where there are several, one that cannot be opened is told in its own.
+    Raises `BadInput` before anything is written if a configuration makes no sense, an environment does not fit, or a
+    directory is not empty.
     """
     if not runs:
         raise BadInput("There is no run to train.")
@@ -108,19 +110,21 @@ def train_all(
         raise BadInput("Every run needs a directory of its own.")
     watcher = watcher or Quiet()
     device = prepare_device(runs[0][0].device)
-    with _workers(workers, device, len(runs)) as pool:
+    with Pools(workers, device, len(runs)) as pools:
         trainees = []
         for config, path in runs:
             own = replace(config, device=device, answering=parts.answering(config))
-            learner, spec = make_learner(own), spec_of(own)
+            spec = spec_of(own)
             _check_fit(own, spec)
-            trainees.append(Trainee(own, path, learner, spec, pool.next() if pool else None))
+            learner = make_learner(own, spec)
+            trainees.append(Trainee(own, path, learner, spec, pools.worker(learner)))
         for trainee in trainees:
             trainee.directory.check_free()
             trainee.reset(0)
         for trainee in trainees:
             trainee.directory.create(trainee.config, rundir.protocol(trainee.spec, device))
-        return _run([(trainee, trainee.begin) for trainee in trainees], watcher, lift, runs_per_device)
+        waiting = [_Waiting(trainee, trainee.begin) for trainee in trainees]
+        return _run(waiting, watcher, lift, runs_per_device, alone=len(runs) == 1)
 
 
 def _check_machine(workers: int | None, runs_per_device: int | None) -> None:
@@ -160,17 +164,18 @@ def resume(
     watcher = watcher or Quiet()
     found = find_runs(path)
     with ExitStack() as stack:
-        pool: Workers | None = None
-        waiting: list[tuple[Trainee, Callable[[], Run]]] = []
+        pools: Pools | None = None
+        waiting: list[_Waiting] = []
         results: list[Result] = []
         for directory in found:
             try:
                 config = load(directory / "config.json")
                 device = prepare_device(config.device)
-                if not waiting:
-                    pool = stack.enter_context(_workers(workers, device, len(found)))
-                worker = pool.next() if pool else None
-                trainee = Trainee(config, directory, make_learner(config), spec_of(config), worker)
+                if pools is None:
+                    pools = stack.enter_context(Pools(workers, device, len(found)))
+                spec = spec_of(config)
+                learner = make_learner(config, spec)
+                trainee = Trainee(config, directory, learner, spec, pools.worker(learner))
                 with rundir.told(directory):
                     trainee.directory.lock()
             except BadInput as error:
@@ -179,7 +184,7 @@ def resume(
                 results.append(_unopened(directory, error, watcher))
                 continue
             _compare_protocol(trainee, device, watcher)
-            waiting.append((trainee, partial(trainee.resume, watcher.say)))
+            waiting.append(_Waiting(trainee, partial(trainee.resume, watcher.say)))
         return results + _run(waiting, watcher, None, runs_per_device, alone=len(found) == 1)
 
 
@@ -207,9 +212,9 @@ def spec_of(config: Config) -> EnvSpec:
     return spec
 
 
-def make_learner(config: Config) -> Learner:
-    """The functions of a run of that configuration."""
-    spec = spec_of(config)
+def make_learner(config: Config, spec: EnvSpec | None = None) -> Learner:
+    """The functions of a run of that configuration, whose environment has that ``spec``."""
+    spec = spec or spec_of(config)
     if ":" not in config.method.explore:  # somebody's own bonus may look at all of it
         spec = replace(spec, name="", horizon=0, tells_success=False)
     return _learner(shape(config), spec)
@@ -221,29 +226,61 @@ def _learner(config: Config, spec: EnvSpec) -> Learner:
     return Learner(config, spec, parts.bonus(config, spec))
 
 
-@contextmanager
-def _workers(count: int | None, device: str, runs: int) -> Iterator[Workers | None]:
-    """Processes for the environments of so many runs, until the end of the block; None: they live in this one."""
-    if count is None:
-        count = min(rundir.threads(), runs) if device == "gpu" else 0
-    pool = Workers(count) if count else None
-    try:
-        yield pool
-    finally:
-        if pool is not None:
+class Pools:
+    """Workers for the environments of each program: programs train in threads of their own, and share none."""
+
+    def __init__(self, count: int | None, device: str, runs: int) -> None:
+        """``count``: of each program's; None: what suits so many runs on that device."""
+        self.count = count_workers(device, runs) if count is None else count
+        self._pools: dict[int, Workers] = {}
+
+    def worker(self, learner: Learner) -> Worker | None:
+        """The next worker of the program of that learner; None: its environments live in this process."""
+        if not self.count:
+            return None
+        if id(learner) not in self._pools:
+            self._pools[id(learner)] = Workers(self.count)
+        return self._pools[id(learner)].next()
+
+    def __enter__(self) -> Pools:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for pool in self._pools.values():
             pool.close()
 
 
+def count_workers(device: str, runs: int) -> int:
+    """How many workers suit so many runs: on a CPU none, because the updates keep all processors busy."""
+    return min(rundir.threads(), runs) if device == "gpu" else 0
+
+
+class _Waiting(NamedTuple):
+    """A run that is to be trained, and what opens its state."""
+
+    trainee: Trainee
+    opened: Callable[[], Run]
+
+    @property
+    def path(self) -> Path:
+        return self.trainee.directory.path
+
+
 class _Together:
-    """One watcher for programs that run side by side."""
+    """One watcher for programs that run side by side. ``stop``: all of them are to stop."""
 
     def __init__(self, watcher: Watcher) -> None:
         self._watcher = watcher
         self._lock = Lock()
+        self._broken = False
 
     @property
     def stop(self) -> bool:
-        return self._watcher.stop
+        return self._broken or self._watcher.stop
+
+    def break_off(self) -> None:
+        """Something happened that ends it all."""
+        self._broken = True
 
     def advance(self, step: int, trainees: Sequence[Trainee]) -> None:
         with self._lock:
@@ -255,45 +292,52 @@ class _Together:
 
 
 def _run(
-    waiting: Sequence[tuple[Trainee, Callable[[], Run]]],
-    watcher: Watcher,
-    lift: Lift | None,
-    runs_per_device: int | None,
-    alone: bool = False,
+    waiting: Sequence[_Waiting], watcher: Watcher, lift: Lift | None, runs_per_device: int | None, alone: bool
 ) -> list[Result]:
-    """Train runs, each given with what opens its state, as many at a time as there is room for.
+    """Train runs, as many at a time as there is room for.
 
     alone: one that cannot be opened ends it all, for there is no other.
     """
     results: dict[Path, Result] = {}
+    left = sorted(waiting, key=lambda run: run.trainee.config.device)
     try:
-        left = list(waiting)
-        while left:
-            device = left[0][0].config.device
+        while left and not (results and watcher.stop):
+            device = left[0].trainee.config.device
             how = lift or lift_for(device)
-            together = _together([trainee for trainee, _ in left], device, how, runs_per_device, watcher)
-            batch, left = left[:together], left[together:]
-            programs: dict[tuple[int, int], list[tuple[Trainee, Run]]] = defaultdict(list)
-            for trainee, opened in batch:
-                try:
-                    run = opened()
-                except BadInput as error:
-                    if alone:
-                        raise
-                    results[trainee.directory.path] = _unopened(trainee.directory.path, error, watcher)
-                    continue
-                programs[id(trainee.learner), trainee.progress.step].append((trainee, run))
-            _train(list(programs.values()), _Together(watcher), how)
-            results |= {t.directory.path: _finish(t) for program in programs.values() for t, _ in program}
-            if watcher.stop:
-                break
+            alike = [run.trainee for run in left if run.trainee.config.device == device]
+            together = _together(alike, device, how, runs_per_device, watcher)
+            results |= _train_batch(left[:together], watcher, how, alone)
+            left = left[together:]
         for trainee, _ in left:
-            trainee.progress.step = next(iter(checkpoint.steps(trainee.directory.checkpoints)), 0)
+            trainee.stand(checkpoint.standing(trainee.directory.checkpoints))
             results[trainee.directory.path] = _finish(trainee)
     finally:
-        for trainee, _ in waiting:
+        for trainee, _ in left:
             trainee.close()
-    return [results[trainee.directory.path] for trainee, _ in waiting]
+    return [results[run.path] for run in waiting]
+
+
+def _train_batch(batch: Sequence[_Waiting], watcher: Watcher, lift: Lift, alone: bool) -> dict[Path, Result]:
+    """Open some runs and train them, those of one learner that stand at one step as one program."""
+    results: dict[Path, Result] = {}
+    programs: dict[int, dict[int, list[tuple[Trainee, Run]]]] = defaultdict(lambda: defaultdict(list))
+    try:
+        for trainee, opened in batch:
+            try:
+                run = opened()
+            except BadInput as error:
+                if alone:
+                    raise
+                results[trainee.directory.path] = _unopened(trainee.directory.path, error, watcher)
+                continue
+            programs[id(trainee.learner)][trainee.progress.step].append((trainee, run))
+            del run
+        _train([list(at_steps.values()) for at_steps in programs.values()], _Together(watcher), lift)
+        opened_runs = [trainee for trainee, _ in batch if trainee.directory.path not in results]
+        return results | {trainee.directory.path: _finish(trainee) for trainee in opened_runs}
+    finally:
+        for trainee, _ in batch:
+            trainee.close()
 
 
 def _together(
@@ -311,19 +355,33 @@ def _together(
     return count
 
 
-def _train(programs: Sequence[Sequence[tuple[Trainee, Run]]], watcher: Watcher, lift: Lift) -> None:
-    """Train several programs: one after the other, or, where the device would idle between, side by side."""
+def _train(groups: Sequence[Sequence[list[tuple[Trainee, Run]]]], watcher: _Together, lift: Lift) -> None:
+    """Train the programs of each group one after the other, and the groups so too; or, under vmap, side by side, where
+    the device would idle between them. The lists of runs are emptied: a state must not be held twice."""
 
-    def train_one(program: Sequence[tuple[Trainee, Run]]) -> None:
-        Training([trainee for trainee, _ in program], Runs([run for _, run in program], lift), watcher).train()
+    def train_group(programs: Sequence[list[tuple[Trainee, Run]]]) -> None:
+        try:
+            for program in programs:
+                trainees = [trainee for trainee, _ in program]
+                runs = Runs([run for _, run in program], lift)
+                program.clear()
+                Training(trainees, runs, watcher).train()
+        except BaseException:
+            watcher.break_off()
+            raise
 
-    if lift == "loop" or len(programs) < 2:
-        for program in programs:
-            train_one(program)
+    if lift == "loop" or len(groups) < 2:
+        for group in groups:
+            train_group(group)
         return
-    with ThreadPoolExecutor(len(programs)) as executor:
-        for done in [executor.submit(train_one, program) for program in programs]:
-            done.result()
+    with ThreadPoolExecutor(len(groups)) as executor:
+        under_way = [executor.submit(train_group, group) for group in groups]
+        try:
+            for done in under_way:
+                done.result()
+        except BaseException:  # an interrupt too
+            watcher.break_off()
+            raise
 
 
 def _finish(trainee: Trainee) -> Result:

@@ -7,8 +7,10 @@ What is rare (sessions, fits, refreshes) is called for one run at a time, by ind
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -263,10 +265,15 @@ def state_bytes(learner: Learner, config: Config) -> int:
 
 
 def device_memory(device: str) -> float:
-    """Bytes of memory there are: the machine's, or what XLA may take of the GPU's."""
+    """Bytes of memory there are: what XLA may take of the GPU's, or what of the machine's is free and allowed."""
     if device == "gpu":
         return float(jax.devices()[0].memory_stats()["bytes_limit"])
-    return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    found = [float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))]
+    with contextlib.suppress(OSError):  # Linux
+        found += [1024.0 * int(n) for n in re.findall(r"MemAvailable:\s*(\d+) kB", Path("/proc/meminfo").read_text())]
+    with contextlib.suppress(OSError):  # a container's limit
+        found += [float(n) for n in re.findall(r"\d+", Path("/sys/fs/cgroup/memory.max").read_text())]
+    return min(found)
 
 
 def lift_for(device: str) -> Lift:

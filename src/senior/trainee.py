@@ -56,10 +56,11 @@ class Progress:
 
 def make_environment(config: Config) -> tuple[Any, EnvSpec]:
     """The environment of a configuration."""
-    return envs.make(**_made_by(config))
+    return envs.make(**made_by(config))
 
 
-def _made_by(config: Config) -> dict[str, Any]:
+def made_by(config: Config) -> dict[str, Any]:
+    """What `senior.envs.make` makes that environment from."""
     return {
         "task": None if config.env else config.task,
         "env": config.env,
@@ -67,13 +68,6 @@ def _made_by(config: Config) -> dict[str, Any]:
         "length_scale": config.length_scale,
         "horizon": config.horizon,
     }
-
-
-def make_place(config: Config, purpose: int, spec: EnvSpec | None = None, worker: Worker | None = None) -> Episodes:
-    """The environment of a configuration, for a purpose; with a ``worker``, which ``spec`` goes with, in that."""
-    if worker is not None and spec is not None:
-        return Remote(worker, _made_by(config), spec, config.seed, purpose)
-    return Local(lambda: make_environment(config), config.seed, purpose)
 
 
 class Trainee:
@@ -90,11 +84,16 @@ class Trainee:
         self.progress = Progress()
         self.failure: str | None = None
         self.done = False
-        self.environment = make_place(config, TRAINING, spec, worker)
-        self.judged_in = make_place(config, EVALUATION, spec, worker)
+        self.environment = self._place(TRAINING, worker)
+        self.judged_in = self._place(EVALUATION, worker)
         self.rule = parts.selection(config) if config.method.learns_reward else None
         self.teacher = parts.teacher(config)
         self._preferences: Preferences | None = None
+
+    def _place(self, purpose: int, worker: Worker | None) -> Episodes:
+        if worker is None:
+            return Local(lambda: make_environment(self.config), self.config.seed, purpose)
+        return Remote(worker, made_by(self.config), self.spec, self.config.seed, purpose)
 
     @property
     def name(self) -> str:
@@ -131,6 +130,10 @@ class Trainee:
         self._open_preferences(0)
         return self.learner.init(self.config)
 
+    def stand(self, progress: dict[str, Any] | None) -> None:
+        """Take over where a checkpoint says the run stands, without its state; None: at the beginning."""
+        self.progress = Progress(**progress) if progress else Progress()
+
     def reset(self, episode: int) -> None:
         """Bring the environment to the beginning of an episode; `BadInput` if it cannot."""
         failed = self.environment.begin(episode)
@@ -153,7 +156,7 @@ class Trainee:
             self.reset(0)
             return self.begin()
         step, run, progress = found
-        self.progress = Progress(**progress)
+        self.stand(progress)
         self.progress.written = int(run.replay.count)  # the checkpoint was made before its own chunk was counted
         self.directory.truncate(self.progress.lengths, step)
         self._open_preferences(self.progress.last_pair)

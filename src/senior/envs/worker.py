@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -44,8 +43,7 @@ class Place:
 
 
 def main(orders: int, answers: int) -> None:
-    """Serve until the pipe of orders ends. An interrupt is for the process that gives them."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Serve until the pipe of orders ends."""
     places: dict[int, Place] = {}
     with open(orders, "rb") as read:
         for line in read:

@@ -63,10 +63,9 @@ class Worker:
     died of.
     """
 
-    def __init__(self, patience: float, fellows: Sequence[Worker]) -> None:
-        """``fellows``: those that take their orders when this one does, itself included."""
+    def __init__(self, patience: float) -> None:
         self.patience = patience
-        self.fellows = fellows
+        self.fellows: Sequence[Worker] = [self]  # those that set out when this one does
         self.life = 0
         self.lost = ""
         self._places = itertools.count()
@@ -82,7 +81,13 @@ class Worker:
         # what is importable here is importable there
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         command = [sys.executable, "-m", "senior.envs.worker", str(orders), str(answers)]
-        self.process = subprocess.Popen(command, pass_fds=(orders, answers), env=environment, stdin=subprocess.DEVNULL)
+        self.process = subprocess.Popen(
+            command,
+            pass_fds=(orders, answers),
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,  # an interrupt is for the process that gives orders
+        )
         os.close(orders)
         os.close(answers)
         self._waiting = select.poll()
@@ -121,19 +126,26 @@ class Worker:
             fellow.set_out()
         until = time.monotonic() + self.patience
         while place not in self._arrived:
-            if not self._waiting.poll(1000 * max(0.0, until - time.monotonic())):
-                raise Lost(f"gave no answer for {self.patience:g} seconds")
+            # looked at every second, because what an environment has started may keep a dead worker's pipe open
+            if not self._waiting.poll(1000 * min(1.0, max(0.0, until - time.monotonic()))):
+                if self.process.poll() is not None:
+                    raise Lost(self._died())
+                if time.monotonic() >= until:
+                    raise Lost(f"gave no answer for {self.patience:g} seconds")
+                continue
             read = self._answers.read(65536)
             if not read:
-                code = self.process.wait()
-                how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-                raise Lost(f"died ({how})")
+                raise Lost(self._died())
             *lines, self._rest = (self._rest + read).split(b"\n")
             for line in lines:
                 number, _, failure = line.decode().partition(" ")
                 self._arrived[int(number)] = failure
             until = time.monotonic() + self.patience
         return self._arrived.pop(place)
+
+    def _died(self) -> str:
+        code = self.process.wait()
+        return f"died ({signal.Signals(-code).name if code < 0 else f'exit code {code}'})"
 
     def restart(self, lost: Lost) -> None:
         """Put a new process in the lost one's place."""
@@ -164,41 +176,51 @@ class Remote:
         self._life = 0  # of the worker, when the environment was built in it
         self._actions: list[np.ndarray] = []  # taken in the running episode, the sent one last
         self._failure: Failure | None = None
+        self._under_way = False  # an action was sent, and nobody has asked what it did
 
     def begin(self, episode: int, afresh: bool = False) -> Failure | None:
         """See `Episodes.begin`."""
+        if self._under_way:
+            self.receive()
         self.episode, self._failure = episode, None
         self._actions.clear()
         if afresh:
             self._life = 0
-        for life in range(LIVES):
+        lives = LIVES
+        while True:
             try:
                 self._begin_there()
-                return self._failure
             except Lost as lost:
                 self._worker.restart(lost)
-                if life == LIVES - 1:
-                    return self._fail(f"{LIVES} workers were lost at its beginning; the last one {lost}.")
-        return None
+                lives -= 1
+                if lives:
+                    continue
+                self._fail(f"{LIVES} workers were lost at its beginning; the last one {lost}.")
+            if self._failure is None:
+                self.observation = self._shared.observation.copy()
+            return self._failure
 
     def send(self, action: np.ndarray) -> None:
         """See `Episodes.send`."""
         if self._failure is None:
             self._actions.append(np.array(action, np.float32))
+            self._under_way = True
             self._send()
 
     def receive(self) -> Step | Failure:
         """See `Episodes.receive`."""
-        for life in range(LIVES):
+        self._under_way = False
+        lives = LIVES
+        while True:
             try:
                 if self._failure is None and self._life != self._worker.life:
                     self._relive()
                 return self._failure or self._received()
             except Lost as lost:
                 self._worker.restart(lost)
-                if life == LIVES - 1:
+                lives -= 1
+                if not lives:
                     return self._fail(f"{LIVES} workers were lost at this step; the last one {lost}.")
-        raise AssertionError
 
     def close(self) -> None:
         """See `Episodes.close`; the worker is closed by whoever made it."""
@@ -224,10 +246,11 @@ class Remote:
                 path = Path(folder) / "shared"
                 self._shared = Shared(path, self.spec)
                 self._ask("open", **self._order, memory=str(path))
+            if self._failure is not None:
+                self._fail(self._failure.message)
+                return
             self._life = self._worker.life
-        if self._failure is None:
-            self._ask("begin", episode=self.episode)
-        self.observation = self._shared.observation.copy()
+        self._ask("begin", episode=self.episode)
 
     def _send(self) -> None:
         if self._life == self._worker.life:
@@ -257,7 +280,7 @@ class Remote:
 
     def _relive(self) -> None:
         """Bring the environment, in a new process, to the step at which the old one was lost, and go on from there."""
-        before, actions = self.observation, self._actions.copy()
+        actions = self._actions.copy()
         self.notes.append(
             f"The worker of the environment {self.spec.name} {self._worker.lost}; another took over in episode "
             f"{self.episode} after step {len(actions) - 1}."
@@ -269,8 +292,7 @@ class Remote:
             self._shared.action[:] = action
             self._worker.step(self._place)
             self._heard()
-            self.observation = self._shared.observation.copy()
-        if self._failure is None and not np.array_equal(before, self.observation):
+        if self._failure is None and not np.array_equal(self.observation, self._shared.observation):
             self._fail("its worker was lost, and it does not repeat an episode from its seed and actions.")
         elif self._failure is None:
             self._send()
@@ -289,8 +311,9 @@ class Workers:
     def __init__(self, count: int, patience: float = PATIENCE) -> None:
         if count < 1:
             raise BadInput(f"There must be at least one worker, not {count}.")
-        self.workers: list[Worker] = []
-        self.workers += [Worker(patience, self.workers) for _ in range(count)]
+        self.workers = [Worker(patience) for _ in range(count)]
+        for worker in self.workers:
+            worker.fellows = self.workers
         self._next = itertools.cycle(self.workers)
 
     def next(self) -> Worker:
