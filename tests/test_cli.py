@@ -356,6 +356,15 @@ def test_help_of_train_tells_what_quick_changes_and_the_defaults_of_the_preset(c
     assert quick != paper
 
 
+def test_options_of_the_machine_reach_the_program(monkeypatch: pytest.MonkeyPatch):
+    asked: list[dict[str, Any]] = []
+    for name in ("train", "resume"):
+        monkeypatch.setattr(program, name, lambda *_, **machine: asked.append(machine) or [])
+    assert main(["train", "--workers", "2", "--runs-per-device", "3"]) == DONE
+    assert main(["resume", "somewhere", "--workers", "0", "--runs-per-device", "auto"]) == DONE
+    assert asked == [{"workers": 2, "runs_per_device": 3}, {"workers": 0, "runs_per_device": None}]
+
+
 def trained_with(arguments: str, monkeypatch: pytest.MonkeyPatch) -> tuple[Config, Path, int]:
     """What `program.train` is asked for."""
     asked: list[Any] = []

@@ -24,7 +24,7 @@ DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 @dataclass(frozen=True)
 class Machine:
-    """How the runs of a command share this machine; what they learn does not depend on it."""
+    """How the runs of a command share this machine."""
 
     workers: int | Literal["auto"] = "auto"
     """Processes that the environments live in; 0: this one. auto: 0 on a CPU, one per processor on a GPU."""
@@ -84,7 +84,8 @@ class BenchOptions:
     runs: tuple[int, ...] = (1,)
     """Runs in the program; several numbers are measured one after the other."""
     environments: int | None = None
-    """Only step so many environments of the task, without learning: stock, here, and in worker processes."""
+    """Only step so many environments of the task, without learning: stock, here, and in worker processes. Of the other
+    options --task and --json are used then."""
     device: str = "auto"
     """auto, cpu or gpu."""
     json: Path | None = None

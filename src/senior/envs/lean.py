@@ -1,6 +1,6 @@
 """Stock Meta-World in less time, to the last bit (``tests/test_envs.py`` holds every task to the stock one).
 
-What is saved, in microseconds of a step (benchmarks/README.md has the figures):
+What is saved (benchmarks/README.md has the figures):
 
 * the model that is stepped holds no visual geoms, where the task reads none of them;
 * of the two hand resets that a reset makes, the first is left out: all that remains of it is what it drew
