@@ -235,9 +235,8 @@ def test_a_session_alone_makes_nothing_ready_until_the_next_refresh():
 # In a learner.
 
 
-@cache
-def learner_of(batch: int = 128, share: float = 0.3) -> learner.Learner:
-    config = replace(
+def config_of(batch: int = 128, share: float = 0.3) -> Config:
+    return replace(
         Config(task="point"),
         steps=200,
         networks=Networks(1, 8, 1, 8),
@@ -246,7 +245,11 @@ def learner_of(batch: int = 128, share: float = 0.3) -> learner.Learner:
         queries=Queries(budget=4, per_session=4, segment=5),
         pge=PreferenceGuided(capacity=E, share=share),
     )
-    spec = point.make()[1]
+
+
+@cache
+def learner_of(batch: int = 128, share: float = 0.3) -> learner.Learner:
+    config, spec = config_of(batch, share), point.make()[1]
     return learner.Learner(config, spec, parts.bonus(config, spec))
 
 
@@ -262,7 +265,7 @@ def begun(preferred: int = 30) -> learner.Run:
 
     @jax.jit
     def begin(held: Replay, count: jax.Array) -> learner.Run:
-        run, _ = tutor.relabel(tutor._init(jnp.uint32(0))._replace(replay=held))
+        run, _ = tutor.relabel(tutor.init(config_of())._replace(replay=held))
         run, _ = tutor.on_session(run, jnp.asarray(preferred_of()), count, jnp.int32(50))
         return tutor.refresh(run, jnp.int32(50))[0]
 
