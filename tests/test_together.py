@@ -246,7 +246,7 @@ def test_as_many_at_a_time_as_the_memory_holds(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(program, "device_memory", lambda device: 2.5 * size)  # nine tenths of it hold two
     said = Said(stop=True)
     train_all([(short(seed=seed), tmp_path / f"seed-{seed}") for seed in range(3)], said)
-    assert f"A run keeps {size / 1e9:.2g} GB; 2 of 3 runs at a time, {2 * size / 1e9:.2g} GB." in said.sentences[0]
+    assert f"A run keeps {size / 1e6:,.1f} MB; 2 of 3 runs at a time, {2 * size / 1e6:,.1f} MB." in said.sentences[0]
 
 
 def test_what_is_told_of_runs_that_are_not_reached_is_where_they_stand(tmp_path: Path):

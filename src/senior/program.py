@@ -348,9 +348,9 @@ def _together(
     # under vmap states are there twice while they are put into one array
     room = np.cumsum(sizes) * (2 if lift == "vmap" else 1) <= 0.9 * device_memory(device)
     count = max(1, min(int(room.sum()), runs_per_device or len(trainees)))
-    told = f"Training on the {device.upper()}, {rundir.threads()} threads. A run keeps {max(sizes) / 1e9:.2g} GB"
+    told = f"Training on the {device.upper()}, {rundir.threads()} threads. A run keeps {max(sizes) / 1e6:,.1f} MB"
     if len(trainees) > 1:
-        told += f"; {count} of {len(trainees)} runs at a time, {sum(sizes[:count]) / 1e9:.2g} GB"
+        told += f"; {count} of {len(trainees)} runs at a time, {sum(sizes[:count]) / 1e6:,.1f} MB"
     watcher.say(f"{told}.")
     return count
 

@@ -140,7 +140,7 @@ def _table(groups: dict[str, list[Run]]) -> str:
             return "-"
         return "{:.2f} [{:.2f}, {:.2f}]".format(*interval(values))
 
-    for method, runs in sorted(groups.items(), key=lambda group: -interval([r.area_by_steps for r in group[1]])[0]):
+    for method, runs in _by_area(groups):
         cells = [
             cell([float(run.success[-1]) for run in runs]),
             cell([run.area_by_steps for run in runs]),
@@ -151,29 +151,40 @@ def _table(groups: dict[str, list[Run]]) -> str:
 
 
 def _draw(groups: dict[str, list[Run]], task: str, path: Path) -> None:
-    """Mean success with its interval, against steps and, for methods that ask, against labels."""
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    by_steps, by_labels = figure.subplots(1, 2, sharey=True)
-    for number, (method, runs) in enumerate(sorted(groups.items())):
-        color = f"C{number}"
-        shared = [list(run.steps) for run in runs]
-        if any(steps != shared[0] for steps in shared):
+    """A row of panels against steps and one against labels, a column per method: every run, their mean and interval."""
+    figure = Figure(figsize=(2.1 * len(groups) + 0.8, 4.8), layout="constrained")
+    panels = figure.subplots(2, len(groups), sharex="row", sharey=True, squeeze=False)
+    for (method, runs), by_steps, by_labels in zip(_by_area(groups), *panels, strict=True):
+        shared = runs[0].steps
+        if any(list(run.steps) != list(shared) for run in runs):
             raise BadInput(f"The runs of {method} were not evaluated at the same steps.")
-        points = np.array([interval(list(column)) for column in np.array([run.success for run in runs]).T])
-        name = f"{method} ({len(runs)})"
-        by_steps.plot(shared[0], points[:, 0], color=color, label=name)
-        by_steps.fill_between(shared[0], points[:, 1], points[:, 2], color=color, alpha=0.12)
-        if not runs[0].asks:
-            continue
-        labels, first = np.unique(runs[0].queried, return_index=True)
-        by_labels.plot(labels, points[first, 0], color=color, marker=".")
-        by_labels.fill_between(labels, points[first, 1], points[first, 2], color=color, alpha=0.12)
-    by_steps.set(xlabel="environment steps", ylabel="success rate", ylim=(-0.03, 1.03), title=f"{task}: mean and 95 %")
-    by_labels.set(xlabel="pairs asked", title="at the first evaluation with so many pairs asked")
-    for axis in (by_steps, by_labels):
-        axis.grid(alpha=0.3)
-    figure.legend(loc="outside right upper")
+        success = np.array([run.success for run in runs])
+        _panel(by_steps, shared / 1000, success)
+        by_steps.set_title(f"{method} ({len(runs)})")
+        if runs[0].asks:
+            labels, first = np.unique(runs[0].queried, return_index=True)
+            _panel(by_labels, labels, success[:, first])
+        else:
+            by_labels.text(0.5, 0.5, "asks nobody", transform=by_labels.transAxes, ha="center", color="gray")
+    panels[0, 0].set(ylabel="success rate", ylim=(-0.03, 1.03))
+    panels[1, 0].set(ylabel="success rate")
+    figure.supxlabel("above: thousand environment steps; below: pairs asked, at the first evaluation with so many")
+    figure.suptitle(f"{task}: every run, their mean and its 95 % interval")
     figure.savefig(path, dpi=110)
+
+
+def _panel(axis: Any, x: np.ndarray, success: np.ndarray) -> None:
+    """``success``: [run, point]."""
+    points = np.array([interval(list(column)) for column in success.T])
+    axis.plot(x, success.T, color="C0", alpha=0.3, linewidth=0.8)
+    axis.plot(x, points[:, 0], color="C0", linewidth=2)
+    axis.fill_between(x, points[:, 1], points[:, 2], color="C0", alpha=0.15, linewidth=0)
+    axis.grid(alpha=0.3)
+
+
+def _by_area(groups: dict[str, list[Run]]) -> list[tuple[str, list[Run]]]:
+    """Methods by their mean area over the steps, the largest first."""
+    return sorted(groups.items(), key=lambda group: -interval([run.area_by_steps for run in group[1]])[0])
 
 
 def main() -> None:
