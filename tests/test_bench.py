@@ -11,7 +11,8 @@ from senior import bench, bench_environments
 from senior.bench import PARTS, multiply_adds
 from senior.cli import DONE, main
 from senior.envs.episodes import Local
-from senior.program import Pools, make_learner
+from senior.program import make_learner
+from senior.together import Pools
 from tests.small import small
 
 

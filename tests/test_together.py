@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from senior import learner, parts, program
+from senior import learner, parts, program, together
 from senior.checkpoint import steps
 from senior.config import Config
 from senior.learner import Learner
@@ -242,8 +242,8 @@ def test_as_many_at_a_time_as_asked_for_and_the_rest_afterwards(tmp_path: Path):
 
 
 def test_as_many_at_a_time_as_the_memory_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    size = program.state_bytes(make_learner(short()), short())
-    monkeypatch.setattr(program, "device_memory", lambda device: 2.5 * size)  # nine tenths of it hold two
+    size = together.state_bytes(make_learner(short()), short())
+    monkeypatch.setattr(together, "device_memory", lambda device: 2.5 * size)  # nine tenths of it hold two
     said = Said(stop=True)
     train_all([(short(seed=seed), tmp_path / f"seed-{seed}") for seed in range(3)], said)
     assert f"A run keeps {size / 1e6:,.1f} MB; 2 of 3 runs at a time, {2 * size / 1e6:,.1f} MB." in said.sentences[0]

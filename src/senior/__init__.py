@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from senior.loop import Watcher
     from senior.methods import METHODS, Method
     from senior.presets import preset, release, with_budget
-    from senior.program import Quiet, Result, resume, train, train_all
+    from senior.program import Quiet, resume, train, train_all
     from senior.schedule import plan
     from senior.select import Context, Selection
+    from senior.together import Result
     from senior.types import Answers, BadInput, EnvSpec, Pairs, Query
 
 _HOME = {
@@ -35,7 +36,7 @@ _HOME = {
     "Pairs": "types",
     "Query": "types",
     "Quiet": "program",
-    "Result": "program",
+    "Result": "together",
     "Selection": "select",
     "Watcher": "loop",
     "evaluate_run": "judgement",

@@ -29,6 +29,7 @@ from senior.loop import Training
 from senior.methods import METHODS
 from senior.presets import preset
 from senior.runs import Runs, lift_for, prepare_device
+from senior.together import Pools
 from senior.trainee import Trainee
 from senior.types import BadInput, EnvSpec
 
@@ -115,7 +116,7 @@ def hastened(config: Config) -> Config:
     )
 
 
-def measure(config: Config, runs: int, device: str, length: int, out: Path, pools: program.Pools) -> dict[str, Any]:
+def measure(config: Config, runs: int, device: str, length: int, out: Path, pools: Pools) -> dict[str, Any]:
     """Figures of one method; ``length`` main-phase steps are timed twice, with and without waiting per part."""
     config = hastened(config)
     learns = config.method.learns_reward
@@ -210,7 +211,7 @@ def run(
     )
     found = []
     for config, count in ((config, count) for config in configs for count in runs):
-        with tempfile.TemporaryDirectory() as folder, program.Pools(None, device, count) as pools:
+        with tempfile.TemporaryDirectory() as folder, Pools(None, device, count) as pools:
             figures = measure(config, count, device, steps, Path(folder), pools)
         found.append(figures)
         missing = float("nan")

@@ -17,7 +17,7 @@ from senior.envs import render
 from senior.envs.episodes import AFTERWARDS, Failure, Local, episode_seed
 from senior.learner import mean_action
 from senior.runs import prepare_device
-from senior.trainee import make_environment
+from senior.trainee import made_by, make_environment
 from senior.types import BadInput
 
 
@@ -103,13 +103,6 @@ def load_policy(path: Path) -> tuple[int, MLP]:
 
 def film(config: Config, purpose: int, episode: int, actions: np.ndarray, out: Path) -> str | None:
     """Write an episode as MP4 by living through it again; None, or the sentence why there is no video."""
-    request = render.Request(
-        task=None if config.env else config.task,
-        seed=episode_seed(config.seed, purpose, episode),
-        actions=actions,
-        env=config.env,
-        position=config.position,
-        length_scale=config.length_scale,
-        horizon=config.horizon,
-    )
+    seed = episode_seed(config.seed, purpose, episode)
+    request = render.Request(**made_by(config), seed=seed, actions=actions)
     return render.record(request, out)
