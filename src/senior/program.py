@@ -1,4 +1,4 @@
-"""Whole programs: train, resume, evaluate. What the command line calls, and what ``import senior`` offers."""
+"""Whole programs: train and resume. What the command line calls, and what ``import senior`` offers."""
 
 from __future__ import annotations
 
