@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import csv
 import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -43,11 +44,14 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def preferences_dump(run: Path) -> list[tuple[Any, ...]]:
-    """All that was asked and answered, without the time of day; of plain SAC nothing."""
+    """All that was asked, a row a pair with its answers at the end, but for what a clock said; of plain SAC nothing."""
     if not (run / "preferences.sqlite").exists():
         return []
-    with sqlite3.connect(run / "preferences.sqlite") as db:
-        names = [row[1] for row in db.execute("PRAGMA table_info(pairs)") if row[1] != "answered_at"]
-        found = db.execute(f"SELECT {', '.join(names)} FROM pairs ORDER BY id").fetchall()
-    db.close()
-    return found
+    with closing(sqlite3.connect(run / "preferences.sqlite")) as db:
+        names = [row[1] for row in db.execute("PRAGMA table_info(answers)")]
+        told = ", ".join(name for name in names if name not in ("pair", "answered_at", "seconds"))
+        answers: dict[int, list[tuple[Any, ...]]] = {}
+        for pair, *answer in db.execute(f"SELECT pair, {told} FROM answers ORDER BY id"):
+            answers.setdefault(pair, []).append(tuple(answer))
+        pairs = db.execute("SELECT id, * FROM pairs ORDER BY id").fetchall()
+    return [(*row, answers.get(number, [])) for number, *row in pairs]

@@ -12,11 +12,12 @@ from senior.agent.networks import MLP
 from senior.reward import bilevel, model
 from senior.reward.bilevel import FirstSteps, OuterNumbers
 from senior.reward.model import RewardModel, Scaling
-from senior.types import Batch, Preferred, Source
+from senior.types import Batch, Source
 from tests.numeric import Arrays, numeric_gradient
 
 O, A, B, M = 3, 2, 6, 4
-FIRST, SECOND, EQUAL = (int(label) for label in (Preferred.FIRST, Preferred.SECOND, Preferred.EQUAL))
+FIRST, SECOND, EQUAL = 0.0, 1.0, 0.5
+"""P(second preferred)."""
 NUMBERS = OuterNumbers(inner_rate=0.05, rate=1e-3, weight=0.1, discount=0.9)
 """The inner rate is large, so that the outer gradient is."""
 outer_step = jax.jit(bilevel.outer_step, static_argnums=6)
@@ -49,13 +50,13 @@ def batch_of(seed: int = 0) -> Batch:
     )
 
 
-def pairs_of(labels: list[int], weight: list[float] | None = None, seed: int = 1) -> FirstSteps:
+def pairs_of(labels: list[float], weight: list[float] | None = None, seed: int = 1) -> FirstSteps:
     rng = np.random.default_rng(seed)
     m = len(labels)
     return FirstSteps(
         rng.normal(size=(m, 2, O)).astype(np.float32),  # pyright: ignore[reportArgumentType]
         rng.uniform(-1, 1, (m, 2, A)).astype(np.float32),  # pyright: ignore[reportArgumentType]
-        np.array(labels, np.int32),  # pyright: ignore[reportArgumentType]
+        np.array(labels, np.float32),  # pyright: ignore[reportArgumentType]
         np.array(weight or [1.0] * m, np.float32),  # pyright: ignore[reportArgumentType]
     )
 
@@ -111,16 +112,14 @@ def outer_by_hand(
 ) -> float:
     """weight x sum over both critics of the mean cross-entropy, of critics moved by the learned reward."""
     target = learned_by_hand(members, batch) + numbers.discount * batch.bootstrap * value
-    share = {FIRST: (1, 0), SECOND: (0, 1), EQUAL: (0.5, 0.5)}
     total = 0.0
     for j in (0, 1):
         virtual = moved([p[j] for p in critics], batch, target, float(numbers.inner_rate))
         for (first, second), label, weight in zip(
-            critic(virtual, pairs.observation, pairs.action), pairs.label, pairs.weight, strict=True
+            critic(virtual, pairs.observation, pairs.action), pairs.second, pairs.weight, strict=True
         ):
             p = 1 / (1 + np.exp(second - first))
-            to_first, to_second = share[int(label)]
-            total -= weight * (to_first * np.log(p) + to_second * np.log(1 - p))
+            total -= weight * ((1 - float(label)) * np.log(p) + float(label) * np.log(1 - p))
     return float(numbers.weight) * total / max(float(np.sum(pairs.weight)), 1)
 
 
@@ -135,10 +134,12 @@ def value_by_hand(agent: sac.Agent, batch: Batch) -> np.ndarray:
 # The gradient.
 
 
-@pytest.mark.parametrize("labels", [[FIRST, SECOND, SECOND, FIRST], [EQUAL, FIRST, EQUAL, SECOND]], ids=str)
+@pytest.mark.parametrize(
+    "labels", [[FIRST, SECOND, SECOND, FIRST], [EQUAL, FIRST, EQUAL, SECOND], [0.25, 1, 2 / 3, 0]], ids=str
+)
 @pytest.mark.parametrize("discount", [0.9, 0.0])
 def test_the_outer_gradient_is_that_of_differences_through_the_inner_step(
-    agent: sac.Agent, reward_model: RewardModel, labels: list[int], discount: float
+    agent: sac.Agent, reward_model: RewardModel, labels: list[float], discount: float
 ):
     batch, pairs, numbers = batch_of(), pairs_of(labels), NUMBERS._replace(discount=discount)
     after, info = outer_step(reward_model, agent, batch, pairs, KEY, numbers, False)
@@ -219,7 +220,7 @@ def test_padded_pairs_have_no_influence(agent: sac.Agent, reward_model: RewardMo
     pairs, batch = pairs_of(labels, weight), batch_of()
     garbage = pairs._replace(
         observation=np.where(pairs.weight[:, None, None] > 0, pairs.observation, 1e3).astype(np.float32),
-        label=np.where(pairs.weight > 0, pairs.label, FIRST).astype(np.int32),
+        second=np.where(pairs.weight > 0, pairs.second, FIRST).astype(np.float32),
     )
     clean = outer_step(reward_model, agent, batch, pairs, KEY, NUMBERS, False)
     assert_same(clean, outer_step(reward_model, agent, batch, garbage, KEY, NUMBERS, False))

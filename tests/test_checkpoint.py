@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from senior import checkpoint, replay
-from senior.checkpoint import Damaged, newest, pack, restore, save, steps, unpack, write_atomically
+from senior.checkpoint import newest, restore, save, steps
+from senior.files import Damaged, pack, unpack, write_atomically
 from senior.learner import Run
 from senior.replay import Fact
 
@@ -192,7 +193,7 @@ def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path, monkeypatch: 
     with monkeypatch.context() as then:
         then.setattr(checkpoint, "FORMAT", 99)
         saved(tmp_path, 2)
-    with pytest.raises(Damaged, match="it has format 99, and this version reads format 2"):
+    with pytest.raises(Damaged, match=f"it has format 99, and this version reads format {checkpoint.FORMAT}"):
         restore(tmp_path, 2, empty())
 
 

@@ -54,7 +54,9 @@ def test_a_rule_and_a_teacher_are_one_file_and_one_line_each(tmp_path: Path):
     )
     assert done.returncode == 0, done.stderr
     with sqlite3.connect(tmp_path / "runs" / "seed-0" / "preferences.sqlite") as file:
-        asked = file.execute("SELECT session, scores, label, annotator FROM pairs ORDER BY id").fetchall()
+        asked = file.execute(
+            "SELECT session, scores, second, annotator FROM pairs JOIN answers ON pair = pairs.id ORDER BY pairs.id"
+        ).fetchall()
     file.close()
     assert [row[2:] for row in asked] == [(1, "second")] * 20
     assert all("uneven" in json.loads(scores) for session, scores, _, _ in asked if session)

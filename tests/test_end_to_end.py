@@ -97,7 +97,7 @@ def test_vmap_and_the_loop_compute_the_same(tmp_path: Path):
     labelled = Labelled(
         rng.normal(size=(*shape, 4)).astype(np.float32),
         rng.uniform(-1, 1, size=(*shape, 2)).astype(np.float32),
-        rng.integers(2, size=shape[0]).astype(np.int32),
+        rng.integers(2, size=shape[0]).astype(np.float32),
         np.int32(20),
     )
     at = np.int32(1000)

@@ -13,15 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from senior import checkpoint
+from senior import checkpoint, loop
 from senior.agent.sac import Agent
+from senior.files import unpack
 from senior.learner import Learner, Run
 from senior.methods import METHODS
 from senior.preferences import Preferences
 from senior.program import Quiet, make_learner, spec_of, train
 from senior.replay import Fact
 from senior.reward.bilevel import FirstSteps
-from senior.reward.model import Labelled, rewards
+from senior.reward.model import EQUAL, Labelled, rewards
 from senior.runs import Runs
 from senior.schedule import plan
 from senior.teachers.scripted import Scripted
@@ -255,7 +256,7 @@ def labelled_first_steps() -> FirstSteps:
     columns: list[Any] = [
         rng.normal(size=(M, 2, 4)).astype(np.float32),
         rng.uniform(-1, 1, (M, 2, 2)).astype(np.float32),
-        rng.integers(2, size=M).astype(np.int32),
+        rng.integers(2, size=M).astype(np.float32),
         np.ones(M, np.float32),
     ]
     return FirstSteps(*columns)
@@ -329,7 +330,7 @@ def test_every_fit_standardises_by_what_is_stored_and_scores_replay_and_curiosit
     labelled = Labelled(
         rng.normal(size=(capacity, 2, SEGMENT, 4)).astype(np.float32),  # pyright: ignore[reportArgumentType]
         rng.uniform(-1, 1, (capacity, 2, SEGMENT, 2)).astype(np.float32),  # pyright: ignore[reportArgumentType]
-        np.zeros(capacity, np.int32),  # pyright: ignore[reportArgumentType]
+        np.zeros(capacity, np.float32),  # pyright: ignore[reportArgumentType]
         np.int32(8),  # pyright: ignore[reportArgumentType]
     )
     run, count = curious._replace(model=new.model), FACTS
@@ -362,12 +363,13 @@ def test_the_pairs_are_the_latest_that_were_labelled_and_padded_without_weight(t
     said = [0, None, -1, 1, 1, 0, None, 1, 0, -1, 1, 0, None, 1, 0, 1]
     labels: list[int] = []
     try:
-        for part in (slice(0, 0), slice(0, 4), slice(4, 14), slice(14, 16)):
+        for session, part in enumerate((slice(0, 0), slice(0, 4), slice(4, 14), slice(14, 16))):
             numbers = np.zeros((len(said[part]), 2), int)
             reward = np.zeros((*numbers.shape, SEGMENT))
             query = Query(Pairs(observation[part], action[part], reward, numbers, numbers))
-            ids = trainee.preferences.add(query, 0, 0, 0, numbers[:, 0])
-            trainee.preferences.answer(Answers(ids, list(said[part])), "test", 0)
+            ids = trainee.preferences.add(query, session, 0, 0, numbers[:, 0])
+            trainee.preferences.answer(Answers(ids, list(said[part])), "test")
+            trainee.preferences.collect(session, 0, trainee.rules)
             kept = [i for i, label in enumerate(said[: part.stop]) if label is not None][-M:]
             pairs = FirstSteps(*map(np.asarray, trainee.latest_pairs()))  # pyright: ignore[reportArgumentType]
             assert [len(column) for column in pairs] == [M] * 4
@@ -375,7 +377,7 @@ def test_the_pairs_are_the_latest_that_were_labelled_and_padded_without_weight(t
             held = pairs.weight == 1
             assert np.array_equal(pairs.observation[held], observation[kept, :, 0])
             assert np.array_equal(pairs.action[held], action[kept, :, 0])
-            assert pairs.label[held].tolist() == [said[i] for i in kept]
+            assert pairs.second[held].tolist() == [{0: 0.0, 1: 1.0, -1: 0.5}[said[i]] for i in kept]
             labels.append(len(kept))
     finally:
         trainee.close()
@@ -443,15 +445,17 @@ class Skipper:
         return replace(answers, labels=[None, int(Preferred.EQUAL), None, *answers.labels[3:]])
 
 
-def test_skipped_pairs_are_spent_and_nothing_is_learned_before_the_first_label(tmp_path: Path):
+def test_skipped_pairs_are_spent_and_nothing_is_learned_before_the_first_label(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Sessions of 10, 10 and 5 pairs at 400, 450 and 500; outer steps are due at 425, 450 and 475."""
     config = replace(
         CONFIG,
         steps=551,
         teacher=f"{__name__}:Skipper",
         bilevel=replace(CONFIG.bilevel, every=25),
-        checkpoint_every=225,
     )
+    monkeypatch.setattr(checkpoint, "KEPT", 9)
     expected = plan(config)
     assert [expected.sessions, expected.queried, expected.outer_steps] == [3, 25, 3]
     (result,) = train(config, tmp_path)
@@ -480,19 +484,44 @@ def test_skipped_pairs_are_spent_and_nothing_is_learned_before_the_first_label(t
     assert [progress["sessions"], progress["queried"], progress["outer_steps"]] == [3, 25, 2]
     preferences = Preferences(result.path / "preferences.sqlite", 25, SEGMENT, 4, 2)
     try:
+        preferences.read(3)
         assert preferences.skipped == 14
-        assert np.count_nonzero(preferences.arrays.label == Preferred.EQUAL) == 2
+        assert np.count_nonzero(preferences.arrays.second[: preferences.arrays.count] == EQUAL) == 2
     finally:
         preferences.close()
     assert result.labels == progress["labels"] == 25 - 14
 
 
 class Dawdler(Scripted):
-    """Leaves one pair for later."""
+    """Answers one pair after the other, the last one first, and every other time none."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.held: list[tuple[int, int | None]] = []
+        self.calls = 0
 
     def collect(self) -> Answers:
         answers = super().collect()
-        return Answers(answers.ids[1:], answers.labels[1:])
+        self.held += zip(answers.ids, answers.labels, strict=True)
+        self.calls += 1
+        if not self.held or self.calls % 2:
+            return Answers([], [])
+        number, label = self.held.pop()
+        return Answers([number], [label])
+
+
+def test_a_teacher_may_take_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The run waits, and is the same as that of one who answers at once."""
+    monkeypatch.setattr(loop, "LISTEN_SECONDS", 0.001)
+    config = replace(CONFIG, steps=UNTIL + 60)
+    (slow,) = train(replace(config, teacher=f"{__name__}:Dawdler"), tmp_path / "slow")
+    (quick,) = train(config, tmp_path / "quick")
+    assert slow.finished and quick.finished
+    assert slow.labels == quick.labels == 20
+    for name in ("eval.csv", "train.csv"):
+        assert (slow.path / name).read_bytes() == (quick.path / name).read_bytes()
+    one, other = (unpack(result.path / "policy" / "actor.npz") for result in (slow, quick))
+    assert all(np.array_equal(one[name], other[name]) for name in other)
 
 
 class Mumbler(Scripted):
@@ -503,11 +532,35 @@ class Mumbler(Scripted):
         return replace(answers, labels=[2, *answers.labels[1:]])
 
 
-@pytest.mark.parametrize("teacher", ["Dawdler", "Mumbler"])
-def test_a_teacher_whose_answers_are_not_whole_stops_its_run_and_nothing_of_them_stays(teacher: str, tmp_path: Path):
+class Stranger(Scripted):
+    """Answers a pair that it was not asked."""
+
+    def collect(self) -> Answers:
+        answers = super().collect()
+        return replace(answers, ids=[99, *answers.ids[1:]])
+
+
+class Stutterer(Scripted):
+    """Answers a pair twice."""
+
+    def collect(self) -> Answers:
+        answers = super().collect()
+        return Answers([*answers.ids, answers.ids[0]], [*answers.labels, answers.labels[0]])
+
+
+class Swallower(Scripted):
+    """Answers fewer pairs than it says."""
+
+    def collect(self) -> Answers:
+        answers = super().collect()
+        return replace(answers, labels=answers.labels[1:])
+
+
+@pytest.mark.parametrize("teacher", ["Mumbler", "Stranger", "Stutterer", "Swallower"])
+def test_a_teacher_who_makes_no_sense_stops_its_run_and_nothing_of_what_it_said_stays(teacher: str, tmp_path: Path):
     (result,) = train(replace(CONFIG, teacher=f"{__name__}:{teacher}"), tmp_path)
     assert (result.finished, result.step, result.labels) == (False, UNTIL, 0)
     assert result.failure is not None
-    assert f"The teacher {__name__}:{teacher} must answer every pair at once" in result.failure
-    assert preferences_dump(result.path) == []
+    assert f"The teacher {__name__}:{teacher} must answer pairs that it was asked, each once" in result.failure
+    assert [row[-1] for row in preferences_dump(result.path)] == [[]] * M  # asked, and not answered
     assert progress_of(result.path)["queried"] == 0

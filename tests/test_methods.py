@@ -97,10 +97,10 @@ def test_a_teacher_errs_in_a_run_as_it_does_by_itself(tmp_path: Path):
             earned = sum(float(row["episode_return"]) for row in before)
             average = 10 * earned / sum(int(row["episode_length"]) for row in before)
             total = preferences.segments(int(pair["id"])).reward[0].astype(float).sum(axis=1)  # pyright: ignore
-            assert (pair["label"] is None) == (total.max() <= 1.05 * average)
-            if pair["label"] is not None:
+            assert (pair["second"] is None) == (total.max() <= 1.05 * average)
+            if pair["second"] is not None:
                 answered += 1
-                turned += pair["label"] != int(total[1] > total[0])
+                turned += pair["second"] != float(total[1] > total[0])
     finally:
         preferences.close()
     assert len(asked) == plan(config).queried

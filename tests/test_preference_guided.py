@@ -334,7 +334,7 @@ def test_the_curiosity_buffer_is_relabelled_with_the_replay_and_no_bonus_is_ever
     labelled = Labelled(
         rng.normal(size=(4, 2, 5, 4)).astype(np.float32),  # pyright: ignore[reportArgumentType]
         rng.uniform(-1, 1, (4, 2, 5, 2)).astype(np.float32),  # pyright: ignore[reportArgumentType]
-        np.array([0, 1, 1, 0], np.int32),  # pyright: ignore[reportArgumentType]
+        np.array([0, 1, 1, 0], np.float32),  # pyright: ignore[reportArgumentType]
         np.int32(4),  # pyright: ignore[reportArgumentType]
     )
     after, _ = jax.jit(tutor.fit)(before, labelled, jnp.int32(60))

@@ -16,7 +16,7 @@ from senior.checks import check
 from senior.config import SAC
 from senior.learner import Learner, Purpose, Run
 from senior.methods import METHODS
-from senior.preferences import Preferences
+from senior.preferences import Preferences, Rules
 from senior.presets import release
 from senior.program import make_learner
 from senior.replay import Fact
@@ -125,7 +125,7 @@ def test_the_outer_step_takes_the_batch_and_the_values_of_the_steps_own_update()
     pairs = FirstSteps(
         rng.normal(size=(m, 2, 4)).astype(np.float32),  # pyright: ignore[reportArgumentType]
         rng.uniform(-1, 1, (m, 2, 2)).astype(np.float32),  # pyright: ignore[reportArgumentType]
-        np.arange(m) % 2,  # pyright: ignore[reportArgumentType]
+        (np.arange(m) % 2).astype(np.float32),  # pyright: ignore[reportArgumentType]
         np.ones(m, np.float32),  # pyright: ignore[reportArgumentType]
     )
     _, info = jax.jit(tutor.outer)(run, pairs, jnp.int32(AT))
@@ -144,7 +144,8 @@ def test_an_equal_pair_adds_its_second_segment_to_the_preferred_positions(tmp_pa
     nothing = np.zeros((3, 2), int)
     pairs = Pairs(observation, np.zeros((3, 2, 3, 1), np.float32), np.zeros((3, 2, 3)), nothing, nothing)
     ids = preferences.add(Query(pairs), 0, 0, 0, nothing[:, 0])
-    preferences.answer(Answers(ids, [0, -1, 1]), "test", 0)
+    preferences.answer(Answers(ids, [0, -1, 1]), "test")
+    preferences.collect(0, 0, Rules())
     ours, count = preferences.preferred_positions(slice(0, 2))
     assert np.array_equal(ours[:count].reshape(-1, 3, 2), [observation[0, 0], observation[2, 1]])
     theirs, count = preferences.preferred_positions(slice(0, 2), "second")

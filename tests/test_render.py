@@ -9,8 +9,9 @@ import av
 import numpy as np
 import pytest
 
-from senior.envs import render
-from senior.envs.render import NoVideo, Request, choose_backend, record
+from senior.envs import drawing, render
+from senior.envs.drawing import NoVideo, choose_backend
+from senior.envs.render import Request, record
 
 
 def frames_of(path: Path) -> tuple[np.ndarray, float]:
@@ -26,7 +27,7 @@ def frames_of(path: Path) -> tuple[np.ndarray, float]:
 
 def opengl() -> bool:
     try:
-        choose_backend(None, render._loads, sys.platform)
+        choose_backend(None, drawing._loads, sys.platform)
     except NoVideo:
         return False
     return True
@@ -37,7 +38,7 @@ def test_meta_world_video(tmp_path: Path):
     out = tmp_path / "new" / "episode.mp4"
     why = record(Request("door-close", 3, actions), out)
     if not opengl():
-        assert why == render.NO_OPENGL
+        assert why == f"There is no video because {drawing.NO_OPENGL}"
         return
     assert why is None
     frames, rate = frames_of(out)
@@ -60,7 +61,7 @@ def test_meta_world_video(tmp_path: Path):
 
 def test_toy_video_needs_no_opengl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("MUJOCO_GL", "off")
-    monkeypatch.setattr(render, "_loads", lambda library: False)
+    monkeypatch.setattr(drawing, "_loads", lambda library: False)
     right = np.tile(np.array([1, 0], np.float32), (9, 1))
     render.draw(Request("point", 0, right), tmp_path / "toy.mp4")
     frames, rate = frames_of(tmp_path / "toy.mp4")
@@ -106,11 +107,11 @@ def test_backend():
 
 def test_no_opengl_is_one_sentence(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setenv("MUJOCO_GL", "off")
-    monkeypatch.setattr(render, "_loads", lambda library: False)
+    monkeypatch.setattr(drawing, "_loads", lambda library: False)
     monkeypatch.setattr(sys, "platform", "linux")
     Request("door-lock", 0, np.zeros((1, 4), np.float32)).write(tmp_path / "request.npz")
     assert render.main([str(tmp_path / "request.npz"), str(tmp_path / "out.mp4")]) == render.NO_VIDEO
-    assert capsys.readouterr().err.strip() == render.NO_OPENGL
+    assert capsys.readouterr().err.strip() == f"There is no video because {drawing.NO_OPENGL}"
     assert not (tmp_path / "out.mp4").exists()
 
 
@@ -121,7 +122,7 @@ def test_opengl_that_does_not_start_is_one_sentence(tmp_path: Path, monkeypatch)
     why = record(Request("door-lock", 0, np.zeros((1, 4), np.float32)), tmp_path / "out.mp4")
     assert why is not None
     assert why.startswith("There is no video because OpenGL glfw does not start")
-    assert why.endswith(render.INSTALL)
+    assert why.endswith(drawing.INSTALL)
 
 
 def test_an_environment_that_draws_nothing(tmp_path: Path, monkeypatch):

@@ -14,11 +14,13 @@ import pytest
 from senior.agent.networks import MLP, apply_mlp, fan_in_uniform
 from senior.reward import model
 from senior.reward.model import FitNumbers, Labelled, RewardModel, Snippets
-from senior.types import Preferred
 from tests.numeric import Arrays, numeric_gradient
 
 O, A, H, CAPACITY, BATCH = 3, 2, 4, 12, 8
-FIRST, SECOND, EQUAL = (int(label) for label in (Preferred.FIRST, Preferred.SECOND, Preferred.EQUAL))
+FIRST, SECOND, EQUAL = 0.0, 1.0, 0.5
+"""P(second preferred)."""
+UNSURE = [0.25, 1.0, 2 / 3, 0.5, 0.0]
+"""Labels of people who differ, or were not sure."""
 RATE = 1e-3
 ONE_EPOCH = FitNumbers(rate=RATE, epochs=1, stop_accuracy=0.97)
 
@@ -40,19 +42,19 @@ def model_of(seed: int = 0, members: int = 3, width: int = 5) -> RewardModel:
     return model.init(jax.random.key(seed), members, O + A, 2, width)
 
 
-def labelled_of(labels: list[int], seed: int = 0, capacity: int = CAPACITY, garbage: float = 0.0) -> Labelled:
+def labelled_of(labels: list[float], seed: int = 0, capacity: int = CAPACITY, garbage: float = 0.0) -> Labelled:
     """Random pairs with those labels; the rows beyond them hold garbage."""
     rng = np.random.default_rng(seed)
     observation = rng.normal(size=(capacity, 2, H, O)).astype(np.float32)
     action = rng.uniform(-1, 1, (capacity, 2, H, A)).astype(np.float32)
-    label = np.full(capacity, SECOND if garbage else FIRST, np.int32)
+    second = np.full(capacity, 1 if garbage else 0, np.float32)
     count = len(labels)
     observation[count:], action[count:] = garbage, garbage
-    label[:count] = labels
-    return Labelled(observation, action, label, np.int32(count))  # pyright: ignore[reportArgumentType]
+    second[:count] = labels
+    return Labelled(observation, action, second, np.int32(count))  # pyright: ignore[reportArgumentType]
 
 
-def mixed(count: int) -> list[int]:
+def mixed(count: int) -> list[float]:
     return [(FIRST, SECOND, EQUAL, SECOND)[i % 4] for i in range(count)]
 
 
@@ -86,12 +88,10 @@ def logits_by_hand(members: Arrays, j: int, labelled: Labelled) -> np.ndarray:
 def loss_by_hand(members: Arrays, labelled: Labelled) -> float:
     """Sum over members of the mean of -log P(answer); an equal pair answers half and half (Eq. 1, 2)."""
     n, total = int(labelled.count), 0.0
-    share = {FIRST: (1, 0), SECOND: (0, 1), EQUAL: (0.5, 0.5)}
     for j in range(len(members[0])):
-        for (first, second), label in zip(logits_by_hand(members, j, labelled), labelled.label, strict=False):
+        for (first, second), label in zip(logits_by_hand(members, j, labelled), labelled.second, strict=False):
             p = np.exp(first) / (np.exp(first) + np.exp(second))
-            to_first, to_second = share[int(label)]
-            total -= (to_first * np.log(p) + to_second * np.log(1 - p)) / n
+            total -= ((1 - float(label)) * np.log(p) + float(label) * np.log(1 - p)) / n
     return total
 
 
@@ -161,8 +161,9 @@ def test_members_begin_different():
     assert not np.any(first[0] == first[1]) and not np.any(first[1] == first[2])
 
 
-def test_targets_are_one_hot_and_half_and_half_where_equal():
-    assert model.targets(jnp.array([FIRST, SECOND, EQUAL])).tolist() == [[1, 0], [0, 1], [0.5, 0.5]]
+def test_targets_are_one_hot_half_and_half_where_equal_and_between_where_people_differ():
+    second = jnp.array([FIRST, SECOND, EQUAL, 0.25])
+    assert model.targets(second).tolist() == [[1, 0], [0, 1], [0.5, 0.5], [0.75, 0.25]]
 
 
 def test_cross_entropy_stays_finite_for_logits_far_apart():
@@ -174,9 +175,9 @@ def test_cross_entropy_stays_finite_for_logits_far_apart():
 # One mini-batch.
 
 
-@pytest.mark.parametrize("labels", [[FIRST], [SECOND], [EQUAL], mixed(7)], ids=str)
+@pytest.mark.parametrize("labels", [[FIRST], [SECOND], [EQUAL], mixed(7), UNSURE], ids=str)
 @pytest.mark.parametrize("part", [32, 3])
-def test_a_step_follows_the_gradient_of_bradley_terry_on_summed_rewards(labels: list[int], part: int):
+def test_a_step_follows_the_gradient_of_bradley_terry_on_summed_rewards(labels: list[float], part: int):
     """The gradient is read from Adam's first moment: means in place of sums, or over rows without a label, differ."""
     before, labelled = model_of(4), labelled_of(labels, garbage=3.0)
     after, _ = fit(part=part)(before, labelled, jax.random.key(0), ONE_EPOCH)
@@ -287,17 +288,17 @@ def test_every_label_is_seen_once_an_epoch(part: int):
 
 def accuracy_by_hand(members: Arrays, labelled: Labelled) -> float:
     """Mean over members of the share of decided pairs whose preferred segment has the higher sum."""
-    label = labelled.label[: int(labelled.count)]
+    label = labelled.second[: int(labelled.count)]
     hits = []
     for j in range(len(members[0])):
         logits = logits_by_hand(members, j, labelled)
-        hits += [(b > a) == (y == SECOND) for (a, b), y in zip(logits, label, strict=True) if y != EQUAL]
+        hits += [(b > a) == (y > EQUAL) for (a, b), y in zip(logits, label, strict=True) if y != EQUAL]
     return float(np.mean(hits))
 
 
-@pytest.mark.parametrize("labels", [mixed(8), [FIRST, EQUAL, EQUAL], [SECOND] * 5], ids=str)
+@pytest.mark.parametrize("labels", [mixed(8), [FIRST, EQUAL, EQUAL], [SECOND] * 5, UNSURE], ids=str)
 @pytest.mark.parametrize("part", [32, 3])
-def test_accuracy_is_measured_before_the_step_and_leaves_equal_pairs_out(labels: list[int], part: int):
+def test_accuracy_is_measured_before_the_step_and_leaves_equal_pairs_out(labels: list[float], part: int):
     before, labelled = model_of(10), labelled_of(labels, garbage=5.0)
     _, info = fit(part=part)(before, labelled, jax.random.key(8), ONE_EPOCH)
     np.testing.assert_allclose(info["fit_accuracy"], accuracy_by_hand(flat(before.members), labelled), rtol=1e-6)
@@ -310,11 +311,11 @@ def test_the_fit_ends_after_the_first_epoch_above_the_wanted_accuracy(right: int
     """Labels that the one member answers itself, but for one: at a rate of nothing its accuracy stays."""
     before, labelled = model_of(11, members=1), labelled_of([FIRST] * 8)
     logits = logits_by_hand(flat(before.members), 0, labelled)
-    label = labelled.label.copy()
+    label = np.array(labelled.second)
     label[:8] = logits[:, 1] > logits[:, 0]
     label[right:8] = 1 - label[right:8]
     numbers = FitNumbers(rate=0.0, epochs=6, stop_accuracy=stop)
-    _, info = fit()(before, labelled._replace(label=label), jax.random.key(9), numbers)
+    _, info = fit()(before, labelled._replace(second=label), jax.random.key(9), numbers)
     assert (float(info["fit_accuracy"]), int(info["fit_epochs"])) == (right / 8, epochs)
 
 
@@ -344,7 +345,7 @@ def test_a_linear_preference_is_learned_and_foretold_for_new_pairs():
     place, action = rng.uniform(-1, 1, (n, 2, 1, O)), np.repeat(rng.uniform(-1, 1, (n, 2, 1, A)), H, axis=2)
     observation = place + rng.uniform(-0.1, 0.1, (n, 2, H, O))
     score = (observation @ np.array([1.0, -2.0, 0.5]) + 0.5 * action[..., 0]).sum(axis=-1)
-    label = (score[:, 1] > score[:, 0]).astype(np.int32)
+    label = (score[:, 1] > score[:, 0]).astype(np.float32)
     observation, action = observation.astype(np.float32), action.astype(np.float32)
     labelled = Labelled(observation[:train], action[:train], label[:train], np.int32(train))  # pyright: ignore
     numbers = FitNumbers(rate=1e-2, epochs=30, stop_accuracy=0.97)

@@ -123,10 +123,10 @@ def trace(tutor: Learner, config: Config) -> None:
         return jax.ShapeDtypeStruct(size, kind)
 
     step, whole = array(kind=np.int32), (config.queries.budget, 2, config.queries.segment)
-    flag, pairs = array(kind=np.bool_), array(whole[0], kind=np.int32)
+    flag, second = array(kind=np.bool_), array(whole[0])
     fact = Fact(array(4), array(2), array(), array(4), flag, flag, step)
-    labelled = Labelled(array(*whole, 4), array(*whole, 2), pairs, step)
-    first_steps = FirstSteps(array(whole[0], 2, 4), array(whole[0], 2, 2), pairs, array(whole[0]))
+    labelled = Labelled(array(*whole, 4), array(*whole, 2), second, step)
+    first_steps = FirstSteps(array(whole[0], 2, 4), array(whole[0], 2, 2), second, array(whole[0]))
     run = jax.eval_shape(lambda: tutor.init(config))
     calls: list[tuple[Any, ...]] = [
         (tutor.store, fact),

@@ -40,7 +40,7 @@ def arm(place: str, strike: Callable[[], None], patch: Callable[[Any, str, Any],
     elif place == "checkpoint":  # half of that of step 650 is in its temporary file, its replay chunk is whole
         before(checkpoint, "write_atomically", halfway)
     elif place == "asked":  # the pairs of the second session are asked, none is answered
-        before(Preferences, "answer", lambda self, *_: self.last == 20)
+        before(Preferences, "answer", lambda _self, answers, *_: max(answers.ids) == 20)
     elif place == "fit":  # the answers of the second session are on the disk, the reward model has not seen them
         before(Trainee, "labelled", lambda self: self.progress.sessions == 2)
     elif place == "saved":  # the last checkpoint is written, and nothing else is done any more

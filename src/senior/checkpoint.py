@@ -1,18 +1,14 @@
 """Checkpoints: one pytree, the host's progress, and the facts of the replay in append-only chunks.
 
-Written to a temporary name, synced and renamed, so that a checkpoint is whole or absent. ``.npz`` members carry
-checksums, which reading verifies. The two newest checkpoints are kept: if the newest is damaged, the one before
+A checkpoint is whole or absent (`senior.files`). The two newest are kept: if the newest is damaged, the one before
 serves. Nothing is pickled.
 """
 
 from __future__ import annotations
 
 import contextlib
-import io
 import json
-import os
 import re
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,55 +16,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from senior.files import Damaged, pack, unpack, write_atomically
 from senior.learner import Run
 from senior.replay import Fact
 
 KEPT = 2
-FORMAT = 2
+FORMAT = 3
 _NAME = re.compile(r"step-(\d{10})\.npz")
 _CHUNK = re.compile(r"facts-(\d{10})-(\d{10})\.npz")
-
-
-class Damaged(Exception):
-    """A checkpoint that cannot be used; the text names the file and says why."""
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """The whole file or none of it, on the disk when this returns."""
-    temporary = path.with_name(path.name + ".tmp")
-    with open(temporary, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
-
-
-def pack(arrays: dict[str, np.ndarray], compress: bool = False) -> bytes:
-    """Arrays as the bytes of an ``.npz`` file."""
-    buffer = io.BytesIO()
-    (np.savez_compressed if compress else np.savez)(buffer, allow_pickle=False, **arrays)
-    return buffer.getvalue()
-
-
-def unpack(path: Path) -> dict[str, np.ndarray]:
-    """Read an ``.npz`` file whole, checksums included; `Damaged` if that fails.
-
-    A member's checksum is verified before its bytes are parsed. Damage makes the decompressor and the parser fail
-    in more ways than can be listed, so any failure counts.
-    """
-    try:
-        with zipfile.ZipFile(path) as file:
-            members = {name.removesuffix(".npy"): file.read(name) for name in file.namelist()}
-        return {
-            name: np.lib.format.read_array(io.BytesIO(member), allow_pickle=False) for name, member in members.items()
-        }
-    except Exception as error:
-        raise Damaged(f"{path.name} is damaged ({error})") from error
 
 
 def steps(directory: Path) -> list[int]:

@@ -97,7 +97,18 @@ def check(config: Config) -> Config:
         rationality is None or rationality == -1 or 0 < rationality < float("inf"),
         f"--rationality must be a positive number, or -1 for always the better segment, not {rationality}.",
     )
+    asking, people = config.asking, config.teacher == "human"
+    _require(asking.overlap >= 1, f"--overlap must be at least 1, not {asking.overlap}.")
+    _require(
+        people or asking.overlap == 1,
+        f"--overlap {asking.overlap} asks several people, and the teacher {config.teacher} is one; leave it out.",
+    )
+    _require(0 <= asking.settle < 3600, f"--settle must be 0 or more seconds, below an hour, not {asking.settle}.")
     row.check()
+    _require(
+        row.learns_reward or not people,
+        f"Method {row.name} learns from the true reward and asks nothing, so --teacher human has no use.",
+    )
     until, random_steps = config.pretraining.until, config.pretraining.random_steps
     if not row.learns_reward:
         _require(until == 0, f"Method {row.name} learns from the true reward, so --pretraining.until must be 0.")

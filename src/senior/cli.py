@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -15,6 +16,7 @@ import tyro
 from tqdm import tqdm
 
 from senior.config import Config
+from senior.label.serving import Address, check_installed
 from senior.options import parse
 from senior.presets import preset, quick_changes, release, with_budget
 from senior.types import BadInput
@@ -37,6 +39,27 @@ class Machine:
 
 
 @dataclass(frozen=True)
+class PageOptions:
+    """Where the labelling page is served (--teacher human)."""
+
+    host: str = "127.0.0.1"
+    """Address to listen on. 0.0.0.0 lets other machines in; who opens the page needs the token in its address."""
+    port: int | Literal["auto"] = "auto"
+    """auto: where the run was served before, else the first free one from 8642 on."""
+    allowed_host: tuple[str, ...] = ()
+    """Further names that browsers may know this machine by."""
+    token: str | None = None
+    """Token of the page's address; left out: the run's own. Empty: everybody on this machine may."""
+
+    def address(self) -> Address:
+        """As `senior.label` takes it."""
+        port = 0 if self.port == "auto" else self.port
+        if not 0 <= port < 2**16:
+            raise BadInput(f"--port {port} must be between 1 and 65535.")
+        return Address(self.host, port, self.allowed_host, self.token)
+
+
+@dataclass(frozen=True)
 class TrainOptions:
     """Train one run, or several in one program; each gets a directory of its own."""
 
@@ -44,6 +67,7 @@ class TrainOptions:
     seeds: int | None = None
     """How many runs: seeds --seed, --seed + 1, ... in one program. Left out: one."""
     machine: Annotated[Machine, tyro.conf.arg(name="")] = field(default_factory=Machine)
+    page: Annotated[PageOptions, tyro.conf.arg(name="")] = field(default_factory=PageOptions)
     out: Path | None = None
     """Directory that takes seed-0/ and so on. Left out: runs/TASK-METHOD-PRESET."""
 
@@ -55,6 +79,7 @@ class ResumeOptions:
     run: tyro.conf.Positional[Path]
     """A run directory, or one that holds some."""
     machine: Annotated[Machine, tyro.conf.arg(name="")] = field(default_factory=Machine)
+    page: Annotated[PageOptions, tyro.conf.arg(name="")] = field(default_factory=PageOptions)
 
 
 @dataclass(frozen=True)
@@ -67,6 +92,15 @@ class EvalOptions:
     """How many episodes."""
     video: Path | None = None
     """Write the first episode as MP4."""
+
+
+@dataclass(frozen=True)
+class LabelOptions:
+    """Serve the labelling page of a run whose teacher are people, without training it."""
+
+    run: tyro.conf.Positional[Path]
+    """A run directory."""
+    page: Annotated[PageOptions, tyro.conf.arg(name="")] = field(default_factory=PageOptions)
 
 
 @dataclass(frozen=True)
@@ -189,7 +223,7 @@ def _train(arguments: list[str]) -> int:
     display = Display()
     try:
         seeds = 1 if options.seeds is None else options.seeds
-        results = program.train(config, out, seeds, display, **options.machine.arguments())
+        results = program.train(config, out, seeds, display, page=options.page.address(), **options.machine.arguments())
     finally:
         display.close()
     return _report(results, display)
@@ -201,7 +235,7 @@ def _resume(arguments: list[str]) -> int:
 
     display = Display()
     try:
-        results = program.resume(options.run, display, **options.machine.arguments())
+        results = program.resume(options.run, display, page=options.page.address(), **options.machine.arguments())
     finally:
         display.close()
     return _report(results, display)
@@ -247,6 +281,21 @@ def _eval(arguments: list[str]) -> int:
         )
         if options.video:
             print(judged.no_video or f"video: {judged.video}")
+    return DONE
+
+
+def _label(arguments: list[str]) -> int:
+    options = parse(LabelOptions, arguments, None, "label")
+    check_installed()
+    from senior import program
+    from senior.label import server
+
+    found = program.find_runs(options.run)
+    if len(found) > 1:
+        raise BadInput(f"There are {len(found)} runs under {options.run}; name one of them.")
+    served = server.serve(found[0], options.page.address(), "user")
+    if served.process != os.getpid():
+        print(f"The run is served already: {served.url}")
     return DONE
 
 
@@ -302,6 +351,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": _train,
     "resume": _resume,
     "eval": _eval,
+    "label": _label,
     "tasks": _tasks,
     "methods": _methods,
     "bench": _bench,
@@ -310,6 +360,7 @@ _SUMMARIES = {
     "train": "train one run, or several seeds in one program",
     "resume": "continue an interrupted run, or all runs under a directory",
     "eval": "judge a run's policy on fresh episodes, and film it",
+    "label": "serve the page on which people compare a run's clips",
     "tasks": "list the tasks",
     "methods": "list the methods, cell by cell",
     "bench": "measure steps per second and where the time goes",

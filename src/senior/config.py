@@ -21,6 +21,10 @@ _FLAT = tyro.conf.arg(name="")
 """A group whose fields are options without the group's name in front."""
 
 
+Switch = Annotated[bool, tyro.conf.FlagConversionOff]
+"""A setting that is given with its value: ``--pge.relabel False``. Plain ones are flags: ``--wait``, ``--no-wait``."""
+
+
 def _flag(name: str) -> Any:
     """A field of a nested group whose command-line name stands alone: ``--bandwidth-mds``."""
     return tyro.conf.arg(name=name, prefix_name=False)
@@ -34,7 +38,7 @@ class Networks:
     """Hidden layers of the actor and of each critic."""
     width: int = 256
     """Units of each hidden layer of the actor and of each critic."""
-    layer_norm: bool = False
+    layer_norm: Switch = False
     """Normalise the hidden layers of the critics before their activation. The papers do not."""
     reward_layers: int = 3
     """Hidden layers of each member of the reward ensemble."""
@@ -101,7 +105,7 @@ class Reward:
     """Pairs of one gradient step."""
     stop_accuracy: float = 0.97
     """A session's fit ends after an epoch with more training accuracy than this."""
-    standardise: bool = False
+    standardise: Switch = False
     """Bring every entry of the observation to mean 0 and deviation 1 (over the replay, taken anew for every fit; within
     10, and what hardly varies stays small) before the reward model sees it. The papers do not."""
     snippets: int = 0
@@ -168,12 +172,12 @@ class PreferenceGuided:
     equal: Literal["left_out", "second"] = "left_out"
     """What a pair called equal adds to the preferred positions: nothing while there are others, or its second segment
     (public code)."""
-    relabel: bool = True
+    relabel: Switch = True
     """Score the curiosity buffer's rows anew whenever the replay is. The public code keeps them as they were drawn."""
     rest: Literal["all", "older"] = "all"
     """Rows that fill the batch up: from all of the replay, or, rounded down, from those older than the last refresh
     that are not in the curiosity buffer (public code)."""
-    refresh_with_outer: bool = True
+    refresh_with_outer: Switch = True
     """Refresh at steps with an outer step too. The public code leaves those refreshes out."""
 
 
@@ -187,7 +191,7 @@ class Bilevel:
     """Factor on the outer loss."""
     optimizer: Annotated[Literal["shared", "separate"], _flag("outer-optimizer")] = "shared"
     """Adam of the outer step: the reward fit's own (public code) or another."""
-    after_budget: bool = False
+    after_budget: Switch = False
     """Go on with outer steps when the budget is spent (the paper's Algorithm 1 read literally)."""
     batch: Literal["uniform", "update"] = "uniform"
     """Batch of the inner step: one of its own from the whole replay (Algorithm 1), or that of the step's update
@@ -231,6 +235,24 @@ class Answering:
 
 
 @dataclass(frozen=True)
+class Asking:
+    """How answers are waited for, and what those of people amount to."""
+
+    wait: bool = True
+    """Wait for all answers to a session, as the paper does; else train on meanwhile, and ask again when all have come.
+    The first session is always waited for: without it there is nothing to learn from."""
+    overlap: int = 1
+    """How many people are asked about each pair. It costs one of the budget, and is trained on by their mean answer."""
+    replace_skipped: bool = False
+    """Ask another pair in place of one that nobody could tell, at most as many as a session has; it costs nothing then.
+    Else a skipped pair counts as asked (B-Pref)."""
+    soft_labels: bool = False
+    """Train "slightly better" towards 0.75 instead of 1."""
+    settle: float = 3.0
+    """Seconds in which the last answer of a session can still be undone."""
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """How often the policy is judged, on episodes of its own."""
 
@@ -256,8 +278,10 @@ class Config:
     compat: Literal["none", "release"] = "none"
     """release: m-senior as its authors' public code behaves, where that differs from the paper."""
     teacher: str = "oracle"
-    """Who answers: oracle (compares true returns), mistake, noisy, skip, equal, myopic, or module:Name."""
+    """Who answers: oracle (compares true returns), mistake, noisy, skip, equal, myopic; human (people, in a browser);
+    a file of labels that were exported (.jsonl); or module:Name."""
     answering: Annotated[Answering, _FLAT] = field(default_factory=Answering)
+    asking: Annotated[Asking, _FLAT] = field(default_factory=Asking)
     env: str | None = None
     """Any Gymnasium environment with Box spaces instead of a task: module:Name or a registered id."""
     position: str | None = None
@@ -297,6 +321,17 @@ class Config:
     def capacity(self) -> int:
         """Rows of the replay buffer."""
         return self.steps if self.replay_capacity is None else self.replay_capacity
+
+
+def made_by(config: Config) -> dict[str, Any]:
+    """What `senior.envs.make` makes the environment of a configuration from."""
+    return {
+        "task": None if config.env else config.task,
+        "env": config.env,
+        "position": config.position,
+        "length_scale": config.length_scale,
+        "horizon": config.horizon,
+    }
 
 
 def to_json(config: Config) -> dict[str, Any]:

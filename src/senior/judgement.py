@@ -11,10 +11,10 @@ import numpy as np
 
 from senior import evaluate, rundir
 from senior.agent.networks import MLP
-from senior.checkpoint import Damaged, unpack
 from senior.config import Config, load
 from senior.envs import render
 from senior.envs.episodes import AFTERWARDS, Failure, Local, episode_seed
+from senior.files import Damaged, unpack
 from senior.learner import mean_action
 from senior.runs import prepare_device
 from senior.trainee import made_by, make_environment

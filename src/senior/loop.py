@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
-from senior import health, session
+from senior import health, parts, session
 from senior.envs.episodes import Episodes, Failure, Step
 from senior.evaluate import judge, summary
 from senior.learner import Purpose, act, acting, actor_of, mean_action
@@ -27,6 +27,11 @@ from senior.replay import Fact
 from senior.runs import PerRun, Proposal, Runs
 from senior.schedule import Due, due
 from senior.trainee import Trainee
+
+LISTEN_EVERY = 10
+"""Steps between looks at whether a session that is not waited for is answered."""
+LISTEN_SECONDS = 0.1
+"""Seconds between such looks at one that is."""
 
 
 class Watcher(Protocol):
@@ -107,11 +112,12 @@ class Training:
                 if self.waits:
                     jax.block_until_ready([actions[i] for i in self.active()])
             happened = None
-            if any(plan.rare for plan in plans):
+            heard = {i for i in self.active() if step % LISTEN_EVERY == 0 and self.heard(i, step)}
+            if heard or any(plan.rare for plan in plans):
                 happened = self.take(actions, step)
                 with self.clock.part("session"):
                     for i in self.active():
-                        self.now_and_then(i, step, plans[i])
+                        self.now_and_then(i, step, plans[i], i in heard)
             with self.clock.part("update"):
                 update = self.update(step, plans)
                 if self.waits:
@@ -123,6 +129,8 @@ class Training:
                 if self.waits:
                     self.wait()
             self.watcher.advance(step + 1, self.trainees)
+            for i in self.active():
+                self.trainees[i].tell("pretraining" if plans[i].pretrain or plans[i].random else "training", step + 1)
 
     def wait(self, update: Proposal | None = None) -> None:
         """Until the device has done everything asked of it, that update included."""
@@ -189,17 +197,18 @@ class Training:
 
     # Now and then, one run at a time.
 
-    def now_and_then(self, i: int, step: int, plan: Due) -> None:
-        """What is rare, in the order of Algorithm 1."""
+    def now_and_then(self, i: int, step: int, plan: Due, heard: bool) -> None:
+        """What is rare, in the order of Algorithm 1; ``heard``: the answers to a session that was not waited for."""
         trainee, learner, at = self.trainees[i], self.trainees[i].learner, np.int32(step)
         progress = trainee.progress
         if plan.begin and trainee.spec.length_scale is None and not progress.measured:
             self.runs.one(i, learner.measure)
             progress.measured = True
-        if plan.session:
-            refused = session.hold(trainee, self.runs, i, step, plan.session, partial(self.warn, i))
-            if refused:
-                self.fail(i, step, refused)
+        if heard:
+            session.learn(trainee, self.runs, i, step, partial(self.warn, i))
+        elif plan.session and not trainee.waits:
+            self.session(i, step, plan.session)
+            if not trainee.goes_on:
                 return
         if plan.outer and progress.labels:
             info = self.runs.one(i, learner.outer, trainee.latest_pairs(), at)
@@ -212,6 +221,42 @@ class Training:
             self.runs.one(i, learner.begin, at)
             progress.updates += trainee.config.sac.reset_updates
 
+    def session(self, i: int, step: int, n: int) -> None:
+        """Ask ``n`` pairs, and learn from the answers if they are there or must be waited for."""
+        trainee = self.trainees[i]
+        warn = partial(self.warn, i)
+        if parts.takes_time(trainee.config) and step > trainee.progress.step:
+            trainee.save(self.runs[i], step)  # whatever befalls it while it waits
+        if not session.ask(trainee, self.runs, i, step, n, warn):
+            return
+        refused, told = session.listen(trainee), False
+        while not refused and not trainee.answered(step):
+            if not (trainee.config.asking.wait or trainee.progress.collected == 0):
+                return
+            if self.watcher.stop:
+                trainee.done = True  # saved above, as it was before it asked
+                return
+            if not told:
+                self.watcher.say(f"{trainee.name} waits for the answers to {n} pairs at step {step:,}.")
+                told = True
+            trainee.tell("waiting", step)
+            time.sleep(LISTEN_SECONDS)
+            refused = session.listen(trainee)
+        if refused:
+            self.fail(i, step, refused)
+        else:
+            session.learn(trainee, self.runs, i, step, warn)
+
+    def heard(self, i: int, step: int) -> bool:
+        """Whether a session that is not waited for has been answered by ``step``."""
+        trainee = self.trainees[i]
+        if not trainee.waits:
+            return False
+        refused = session.listen(trainee)
+        if refused:
+            self.fail(i, step, refused)
+        return not refused and trainee.answered(step)
+
     # Looking back: evaluation, snapshots, checkpoints.
 
     def look_back(self, step: int, last: bool) -> None:
@@ -223,6 +268,8 @@ class Training:
             and (step % self.trainees[i].config.evaluation.every == 0 or step == self.trainees[i].config.steps)
         ]
         if judged:
+            for i in judged:
+                self.trainees[i].tell("evaluating", step)
             with self.clock.part("evaluate"):
                 self.evaluate(judged, step)
         for i in self.active():

@@ -32,7 +32,7 @@ def parse(
                 description=text,
                 args=arguments,
                 return_unknown_args=True,
-                config=(tyro.conf.FlagConversionOff, tyro.conf.AvoidSubcommands),
+                config=(tyro.conf.AvoidSubcommands,),
                 **extra,
             )
     except SystemExit as end:

@@ -11,7 +11,7 @@ from typing import Any
 from senior.config import Answering, Config
 from senior.explore import BONUSES, Bonus
 from senior.select import RULES, Rule
-from senior.teachers import TEACHERS, Teacher, scripted
+from senior.teachers import TEACHERS, Teacher, recorded, scripted
 from senior.types import BadInput, EnvSpec
 
 
@@ -62,15 +62,28 @@ def answering(config: Config) -> Answering:
     asked = {name: value for name, value in asdict(config.answering).items() if value is not None}
     own = scripted.TEACHERS.get(config.teacher)
     if own is None:
-        load(config.teacher, TEACHERS, "teacher")
+        if not is_recorded(config):
+            load(config.teacher, TEACHERS, "teacher")
         if asked:
             raise BadInput(f"--{next(iter(asked))} is a number of scripted teachers, and {config.teacher} is none.")
         return config.answering
     return Answering(**{**own._asdict(), **asked})
 
 
+def takes_time(config: Config) -> bool:
+    """Whether a run's teacher may let it wait: whoever is neither scripted nor recorded."""
+    return config.teacher not in scripted.TEACHERS and not is_recorded(config)
+
+
+def is_recorded(config: Config) -> bool:
+    """Whether the teacher of a run is a file of labels."""
+    return config.teacher.endswith(recorded.SUFFIX)
+
+
 def teacher(config: Config) -> Teacher:
     """Who answers in a run."""
+    if is_recorded(config):
+        return recorded.Recorded()
     make = load(config.teacher, TEACHERS, "teacher")
     if config.teacher not in scripted.TEACHERS:
         return make()

@@ -1,8 +1,11 @@
-"""What was said: one SQLite file per run, whoever the teacher is. Imports no JAX.
+"""What was asked and said: one SQLite file per run, whoever the teacher is. Imports no JAX.
 
 Every asked pair is a row, with both segments copied in, so that nothing said is ever stale or lost: where the
-segments came from, the scores they were chosen by, the model's prediction before it was fitted, the answer, who
-gave it, when, at which step, and which side was shown left. An answer is on the disk before it is used.
+segments came from, the scores they were chosen by, the model's prediction before it was fitted, which side is shown
+left. Every answer is a row too: who gave it, when, how surely. The trainer *collects* a session once all of it is
+answered: then the label that each pair is trained on, and the step at which it was, are on the disk before the fit. So
+a run that goes on after it was killed trains on the same labels at the same steps, and people may answer at any time
+(`senior.label.desk`), in other processes.
 """
 
 from __future__ import annotations
@@ -10,36 +13,108 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from senior.types import Answers, BadInput, Pairs, Preferred, Query
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+BUSY_SECONDS = 30.0
+"""How long a process waits for another one's transaction."""
 _SCHEMA = """
 CREATE TABLE pairs (
-    id            INTEGER PRIMARY KEY,  -- in the order of asking, from 1
-    session       INTEGER NOT NULL,
-    step          INTEGER NOT NULL,     -- environment step at which it was asked
-    run_seed      INTEGER NOT NULL,
-    episode_0     INTEGER NOT NULL, start_0 INTEGER NOT NULL,
-    episode_1     INTEGER NOT NULL, start_1 INTEGER NOT NULL,
-    observation   BLOB NOT NULL,        -- float32 little-endian [2, H, o]
-    action        BLOB NOT NULL,        -- float32 little-endian [2, H, a]
-    reward        BLOB NOT NULL,        -- float32 little-endian [2, H], true reward
-    scores        TEXT NOT NULL,        -- JSON object: what selection knew of the pair
-    prediction    REAL,                 -- P(second preferred) before the fit
-    answered      INTEGER NOT NULL DEFAULT 0,
-    label         INTEGER,              -- 0 first, 1 second, -1 equal; NULL where skipped or not answered
-    annotator     TEXT,
-    answered_at   REAL,                 -- seconds since 1970
-    answered_step INTEGER,              -- environment step at which the answer was collected
-    shown_left    INTEGER NOT NULL      -- 0 or 1: which segment was shown on the left
+    id             INTEGER PRIMARY KEY,         -- in the order of asking, from 1
+    session        INTEGER NOT NULL,
+    reserve        INTEGER NOT NULL DEFAULT 0,  -- 1: asked only in place of one that was skipped
+    step           INTEGER NOT NULL,            -- environment step at which it was asked
+    run_seed       INTEGER NOT NULL,
+    episode_0      INTEGER NOT NULL, start_0 INTEGER NOT NULL,
+    episode_1      INTEGER NOT NULL, start_1 INTEGER NOT NULL,
+    observation    BLOB NOT NULL,               -- float32 little-endian [2, H, o]
+    action         BLOB NOT NULL,               -- float32 little-endian [2, H, a]
+    reward         BLOB NOT NULL,               -- float32 little-endian [2, H], true reward
+    scores         TEXT NOT NULL,               -- JSON object: what selection knew of the pair
+    prediction     REAL,                        -- P(second preferred) before the fit
+    shown_left     INTEGER NOT NULL,            -- 0 or 1: which segment is shown on the left
+    collected_step INTEGER,                     -- environment step at which its answers were taken; NULL: not yet
+    second         REAL                         -- P(second preferred) that is trained on; NULL: skipped, or not yet
 );
+CREATE TABLE answers (
+    id          INTEGER PRIMARY KEY,
+    pair        INTEGER NOT NULL REFERENCES pairs (id),
+    annotator   TEXT NOT NULL,
+    answer      INTEGER,                        -- 0 first, 1 second, -1 equal; NULL skipped
+    strength    TEXT,                           -- slightly, clearly or NULL: not told
+    answered_at REAL NOT NULL,                  -- seconds since 1970
+    seconds     REAL,                           -- from the first showing to the answer
+    replays     INTEGER,                        -- how often the clips began again
+    shown_left  INTEGER NOT NULL,
+    clip_0      TEXT, clip_1 TEXT,              -- SHA-256 of the two clips that were shown
+    withdrawn   INTEGER                         -- NULL: it stands; n > 0: the n-th to be undone; 0: for good
+);
+CREATE UNIQUE INDEX standing ON answers (pair, annotator) WHERE withdrawn IS NULL;
+CREATE TABLE posts (id TEXT PRIMARY KEY, outcome TEXT NOT NULL);  -- what a page sent, by an id that it made, once
+CREATE TABLE leases (
+    pair      INTEGER NOT NULL REFERENCES pairs (id),
+    annotator TEXT NOT NULL,
+    until     REAL NOT NULL,                    -- seconds since 1970
+    PRIMARY KEY (pair, annotator)
+);
+CREATE TABLE episodes (                         -- those that pairs were cut from, whole, to be lived through again
+    episode INTEGER PRIMARY KEY,
+    seed    INTEGER NOT NULL,
+    action  BLOB NOT NULL                       -- float32 little-endian [n, a]
+);
+CREATE TABLE clips (
+    pair    INTEGER NOT NULL REFERENCES pairs (id),
+    side    INTEGER NOT NULL,                   -- 0 or 1
+    name    TEXT,                               -- of the file, without .mp4; NULL: it could not be drawn
+    frames  INTEGER, fps REAL,
+    speed   REAL,                               -- as a share of the robot's own
+    sha256  TEXT,
+    failure TEXT,                               -- why not, in a sentence
+    PRIMARY KEY (pair, side)
+);
+CREATE TABLE notes (name TEXT PRIMARY KEY, value TEXT NOT NULL);  -- goal: the sentence that people are shown
 CREATE TABLE shape (steps INTEGER, observation INTEGER, action INTEGER);  -- of every segment: H, o, a
 """
+
+
+PAIR = (
+    "id",
+    "session",
+    "reserve",
+    "step",
+    "run_seed",
+    "episode_0",
+    "start_0",
+    "episode_1",
+    "start_1",
+    "scores",
+    "prediction",
+    "shown_left",
+    "collected_step",
+    "second",
+)
+"""What is told of a pair beside its segments."""
+ANSWER = (
+    "id",
+    "annotator",
+    "answer",
+    "strength",
+    "answered_at",
+    "seconds",
+    "replays",
+    "shown_left",
+    "clip_0",
+    "clip_1",
+    "withdrawn",
+)
+"""What is told of an answer beside its pair."""
 
 
 class LabelledArrays(NamedTuple):
@@ -47,12 +122,129 @@ class LabelledArrays(NamedTuple):
 
     observation: np.ndarray  # [capacity, 2, H, o] float32
     action: np.ndarray  # [capacity, 2, H, a] float32
-    label: np.ndarray  # [capacity] int32, a Preferred
+    second: np.ndarray  # [capacity] float32: P(second preferred): 0, 1, 0.5 where equal, between where people differ
     count: int
 
 
+class Rules(NamedTuple):
+    """What answers amount to."""
+
+    overlap: int = 1
+    """How many people are asked about each pair."""
+    replace_skipped: bool = False
+    """Whether another pair is asked in place of a skipped one, while there are any in reserve."""
+    soft: bool = False
+    """Whether "slightly" means a target of 0.75 instead of 1."""
+
+
+class Said(NamedTuple):
+    """An answer that stands."""
+
+    annotator: str
+    answer: int | None
+    strength: str | None
+    answered_at: float
+
+
+class Asked(NamedTuple):
+    """A pair, without its segments, and what was said of it."""
+
+    id: int
+    session: int
+    reserve: bool
+    step: int
+    shown_left: int
+    collected_step: int | None
+    said: tuple[Said, ...]
+
+    def complete(self, rules: Rules) -> bool:
+        """Whether all who are asked have answered."""
+        return len(self.said) >= rules.overlap
+
+    def skipped(self, rules: Rules) -> bool:
+        """Whether all who were asked could not tell."""
+        return self.complete(rules) and all(one.answer is None for one in self.said)
+
+    def second(self, rules: Rules) -> float | None:
+        """P(second preferred) by the mean of the answers in [0, 1]; None if all skipped."""
+        told = [_second(one, rules.soft) for one in self.said if one.answer is not None]
+        return sum(told) / len(told) if told else None
+
+
+def _second(said: Said, soft: bool) -> float:
+    if said.answer == Preferred.EQUAL:
+        return 0.5
+    margin = 0.25 if soft and said.strength == "slightly" else 0.0
+    return 1 - margin if said.answer == Preferred.SECOND else margin
+
+
+def asked_of(pairs: Sequence[Asked], rules: Rules) -> list[Asked]:
+    """Those of a session's pairs that are asked: all but the reserves, and a reserve for every one that is skipped."""
+    chosen = [pair for pair in pairs if not pair.reserve]
+    if rules.replace_skipped:
+        wanted = len(chosen)
+        reserves = (pair for pair in pairs if pair.reserve)
+        while sum(not pair.skipped(rules) for pair in chosen) < wanted and (more := next(reserves, None)):
+            chosen.append(more)
+    return chosen
+
+
+def connect(path: Path) -> sqlite3.Connection:
+    """Open an existing preference file or make an empty one, without its tables.
+
+    Transactions are explicit (`transaction`); a commit is on the disk. Raises `BadInput` if it cannot be read or is
+    of another schema version.
+    """
+    try:
+        # one thread after another uses it
+        db = sqlite3.connect(path, timeout=BUSY_SECONDS, isolation_level=None, check_same_thread=False)
+        try:
+            db.execute("PRAGMA journal_mode=WAL")
+            db.execute("PRAGMA synchronous=FULL")
+            version = db.execute("PRAGMA user_version").fetchone()[0]
+        except sqlite3.Error:
+            db.close()
+            raise
+    except sqlite3.Error as error:
+        raise BadInput(f"{path} cannot be used: {error}.") from error
+    if version not in (0, SCHEMA_VERSION):
+        db.close()
+        raise BadInput(f"{path} has schema version {version}; this program reads {SCHEMA_VERSION}.")
+    return db
+
+
+@contextmanager
+def transaction(db: sqlite3.Connection) -> Iterator[None]:
+    """All of what is done within, or nothing; on the disk at the end. No other process writes meanwhile."""
+    db.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+    except BaseException:
+        db.execute("ROLLBACK")
+        raise
+    db.execute("COMMIT")
+
+
+def pairs_of(db: sqlite3.Connection, where: str, *values: object) -> list[Asked]:
+    """Pairs that meet an SQL condition, in the order of asking, with the answers that stand, in the order of giving."""
+    said: dict[int, list[Said]] = {}
+    for number, *rest in db.execute(
+        "SELECT pair, annotator, answer, strength, answered_at FROM answers WHERE withdrawn IS NULL "
+        f"AND pair IN (SELECT id FROM pairs WHERE {where}) ORDER BY id",
+        values,
+    ):
+        said.setdefault(number, []).append(Said(*rest))
+    rows = db.execute(
+        f"SELECT id, session, reserve, step, shown_left, collected_step FROM pairs WHERE {where} ORDER BY id", values
+    )
+    return [
+        Asked(number, session, bool(reserve), step, left, collected, tuple(said.get(number, ())))
+        for number, session, reserve, step, left, collected in rows.fetchall()
+    ]
+
+
 class Preferences:
-    """The file of one run, opened for reading and writing.
+    """The trainer's side of the file of one run.
 
     ``capacity`` is the budget: no label is ever dropped. Opening creates the file; one that cannot be read, or is of
     another schema version, is a `BadInput`.
@@ -62,89 +254,187 @@ class Preferences:
         self.arrays = LabelledArrays(
             np.zeros((capacity, 2, segment, observation_size), np.float32),
             np.zeros((capacity, 2, segment, action_size), np.float32),
-            np.zeros(capacity, np.int32),
+            np.zeros(capacity, np.float32),
             0,
         )
+        self._path = path
         self._shape = (segment, observation_size, action_size)
+        self._db = connect(path)
         try:
-            self._db = sqlite3.connect(path, check_same_thread=False)  # one thread after another uses it
-            self._open(path)
+            if self._db.execute("PRAGMA user_version").fetchone()[0] == 0:
+                row = "INSERT INTO shape VALUES ({:d}, {:d}, {:d});".format(*self._shape)
+                self._db.executescript(f"BEGIN IMMEDIATE; {_SCHEMA} {row} PRAGMA user_version={SCHEMA_VERSION}; COMMIT")
+            held = self._db.execute("SELECT * FROM shape").fetchone()
         except sqlite3.Error as error:
+            self._db.close()
             raise BadInput(f"{path} cannot be used: {error}.") from error
-
-    def _open(self, path: Path) -> None:
-        self._db.execute("PRAGMA journal_mode=WAL")
-        self._db.execute("PRAGMA synchronous=FULL")
-        version = self._db.execute("PRAGMA user_version").fetchone()[0]
-        if version == 0:
-            row = "INSERT INTO shape VALUES ({:d}, {:d}, {:d});".format(*self._shape)
-            self._db.executescript(f"BEGIN; {_SCHEMA} {row} PRAGMA user_version={SCHEMA_VERSION}; COMMIT;")
-        elif version != SCHEMA_VERSION:
-            raise BadInput(f"{path} has schema version {version}; this program reads {SCHEMA_VERSION}.")
-        self._read()
+        if held != self._shape:
+            self._db.close()
+            names = "steps of a segment, of an observation and of an action"
+            raise BadInput(f"{path} holds other sizes ({names}) than the run has: {held}, not {self._shape}.")
 
     def close(self) -> None:
         """Write everything back into the one file and close it."""
         self._db.close()
 
-    @property
-    def last(self) -> int:
-        """Number of the last pair asked, 0 if none: a checkpoint remembers it."""
-        return self._db.execute("SELECT COALESCE(MAX(id), 0) FROM pairs").fetchone()[0]
+    # Asking.
 
-    @property
-    def skipped(self) -> int:
-        """Pairs that were answered with a skip."""
-        return self._db.execute("SELECT COUNT(*) FROM pairs WHERE answered AND label IS NULL").fetchone()[0]
+    def add(
+        self,
+        query: Query,
+        session: int,
+        step: int,
+        run_seed: int,
+        shown_left: np.ndarray,
+        reserves: int = 0,
+        episodes: Mapping[int, tuple[int, np.ndarray]] | None = None,
+    ) -> list[int]:
+        """Record pairs as asked; returns their numbers.
 
-    def truncate(self, last: int) -> None:
-        """Forget pairs after number ``last``: a resumed run asks them again, alike."""
-        with self._db:
-            self._db.execute("DELETE FROM pairs WHERE id > ?", (last,))
-        self._read()
-
-    def add(self, query: Query, session: int, step: int, run_seed: int, shown_left: np.ndarray) -> list[int]:
-        """Record pairs as asked; returns their numbers."""
-        pairs, first = query.pairs, self.last + 1
-        ids = list(range(first, first + len(pairs)))
-        rows = [
-            (
-                number,
-                session,
-                step,
-                run_seed,
-                *(int(value) for side in (0, 1) for value in (pairs.episode[i, side], pairs.start[i, side])),
-                _blob(pairs.observation[i]),
-                _blob(pairs.action[i]),
-                _blob(pairs.reward[i]),
-                json.dumps({name: float(score[i]) for name, score in query.scores.items()}),
-                None if query.prediction is None else float(query.prediction[i]),
-                int(shown_left[i]),
-            )
-            for i, number in enumerate(ids)
-        ]
+        reserves: how many, the last ones, are asked only in place of skipped ones.
+        episodes: those the segments were cut from, as (seed, actions [n, a]).
+        """
+        pairs = query.pairs
         columns = (
-            "id, session, step, run_seed, episode_0, start_0, episode_1, start_1, observation, action, reward, "
-            "scores, prediction, shown_left"
+            "id, session, reserve, step, run_seed, episode_0, start_0, episode_1, start_1, observation, action, "
+            "reward, scores, prediction, shown_left"
         )
-        with self._db:
+        with transaction(self._db):
+            first = self._db.execute("SELECT COALESCE(MAX(id), 0) FROM pairs").fetchone()[0] + 1
+            ids = list(range(first, first + len(pairs)))
+            rows = [
+                (
+                    number,
+                    session,
+                    i >= len(pairs) - reserves,
+                    step,
+                    run_seed,
+                    *(int(value) for side in (0, 1) for value in (pairs.episode[i, side], pairs.start[i, side])),
+                    _blob(pairs.observation[i]),
+                    _blob(pairs.action[i]),
+                    _blob(pairs.reward[i]),
+                    json.dumps({name: float(score[i]) for name, score in query.scores.items()}),
+                    None if query.prediction is None else float(query.prediction[i]),
+                    int(shown_left[i]),
+                )
+                for i, number in enumerate(ids)
+            ]
             marks = ", ".join("?" * len(columns.split(", ")))
             self._db.executemany(f"INSERT INTO pairs ({columns}) VALUES ({marks})", rows)
+            self._db.executemany(
+                "INSERT OR IGNORE INTO episodes VALUES (?, ?, ?)",
+                [(number, seed, _blob(action)) for number, (seed, action) in (episodes or {}).items()],
+            )
         return ids
 
-    def answer(self, answers: Answers, annotator: str, step: int) -> None:
-        """Record answers; they are on the disk when this returns."""
-        now = time.time()
-        with self._db:
+    def take_over(
+        self,
+        pairs: Sequence[Mapping[str, Any]],
+        segments: Sequence[np.ndarray],
+        answers: Sequence[Mapping[str, Any]],
+    ) -> None:
+        """Put pairs that were asked elsewhere, and all that was said of them, into a file that holds none.
+
+        pairs: every name of `PAIR`, in the order of asking. segments: their observation [P, 2, H, o], action
+        [P, 2, H, a] and true reward [P, 2, H]. answers: every name of `ANSWER`, and pair. Raises `BadInput` if
+        something was asked already; then nothing is changed.
+        """
+        blobs = [[_blob(row) for row in column] for column in segments]
+        rows = [[pair[name] for name in PAIR] for pair in pairs]
+        columns = (*PAIR, "observation", "action", "reward")
+        with transaction(self._db):
+            if self._db.execute("SELECT 1 FROM pairs").fetchone():
+                raise BadInput(f"{self._path} holds pairs already; labels can be put in only before any is asked.")
             self._db.executemany(
-                "UPDATE pairs SET answered = 1, label = ?, annotator = ?, answered_at = ?, answered_step = ? "
-                "WHERE id = ?",
-                [
-                    (label, annotator, now, step, number)
-                    for number, label in zip(answers.ids, answers.labels, strict=True)
-                ],
+                f"INSERT INTO pairs ({', '.join(columns)}) VALUES ({', '.join('?' * len(columns))})",
+                [(*row, *own) for row, *own in zip(rows, *blobs, strict=True)],
             )
-        self._read()
+            self._db.executemany(
+                f"INSERT INTO answers (pair, {', '.join(ANSWER)}) VALUES (?{', ?' * len(ANSWER)})",
+                [[answer[name] for name in ("pair", *ANSWER)] for answer in answers],
+            )
+
+    def session(self, number: int) -> list[int]:
+        """Numbers of the pairs chosen for a session, reserves included; none if it was not held yet."""
+        return [row[0] for row in self._db.execute("SELECT id FROM pairs WHERE session = ? ORDER BY id", (number,))]
+
+    def unanswered(self, session: int, rules: Rules) -> list[int]:
+        """Numbers of those pairs of a session that answers are waited for."""
+        chosen = asked_of(pairs_of(self._db, "session = ?", session), rules)
+        return [pair.id for pair in chosen if not pair.complete(rules)]
+
+    def query(self, ids: Sequence[int], reward_per_step: float) -> Query:
+        """Asked pairs as they were put."""
+        held = [self.segments(number) for number in ids]
+        pairs = Pairs(*(np.concatenate(columns) for columns in zip(*held, strict=True)))
+        marks = ", ".join("?" * len(ids))
+        rows = self._db.execute(f"SELECT scores, prediction FROM pairs WHERE id IN ({marks}) ORDER BY id", ids)
+        scores, prediction = zip(*((json.loads(text), told) for text, told in rows), strict=True)
+        return Query(
+            pairs,
+            {name: np.array([one[name] for one in scores]) for name in scores[0]},
+            None if None in prediction else np.array(prediction),
+            reward_per_step,
+        )
+
+    # Answers.
+
+    def answer(self, answers: Answers, annotator: str) -> None:
+        """Record what one teacher said; it is on the disk when this returns."""
+        now = time.time()
+        with transaction(self._db):
+            self._db.executemany(
+                "INSERT INTO answers (pair, annotator, answer, answered_at, shown_left) "
+                "SELECT id, ?, ?, ?, shown_left FROM pairs WHERE id = ?",
+                [(annotator, label, now, number) for number, label in zip(answers.ids, answers.labels, strict=True)],
+            )
+
+    def ready(self, session: int, step: int, rules: Rules, settle: float = 0.0) -> bool:
+        """Whether a session can be collected at ``step``.
+
+        All of it is answered, the last answer at least ``settle`` seconds old, so that it could be undone; or it was
+        collected at that very step before, in a life of the run that did not last.
+        """
+        pairs = pairs_of(self._db, "session = ?", session)
+        before = [pair.collected_step for pair in pairs if pair.collected_step is not None]
+        if before:
+            return before[0] == step
+        chosen = asked_of(pairs, rules)
+        latest = max((one.answered_at for pair in chosen for one in pair.said), default=0.0)
+        return all(pair.complete(rules) for pair in chosen) and time.time() - latest >= settle
+
+    def collect(self, session: int, step: int, rules: Rules) -> None:
+        """Take the answers to a session as they stand: from now on they are trained on, and cannot be undone.
+
+        One that was collected before stays as it was. `read` is told of one session more afterwards.
+        """
+        with transaction(self._db):
+            pairs = pairs_of(self._db, "session = ? AND collected_step IS NULL", session)
+            self._db.executemany(
+                "UPDATE pairs SET collected_step = ?, second = ? WHERE id = ?",
+                [(step, pair.second(rules), pair.id) for pair in asked_of(pairs, rules)],
+            )
+        self.read(session + 1)
+
+    def read(self, sessions: int) -> None:
+        """Fill the arrays with the labels of so many sessions, from the first one on."""
+        steps, o, a = self._shape
+        labelled = "SELECT observation, action, second FROM pairs WHERE second IS NOT NULL AND session < ? ORDER BY id"
+        count = 0
+        for count, (observation, action, second) in enumerate(self._db.execute(labelled, (sessions,)), start=1):
+            self.arrays.observation[count - 1] = _array(observation, (2, steps, o))
+            self.arrays.action[count - 1] = _array(action, (2, steps, a))
+            self.arrays.second[count - 1] = second
+        for column in self.arrays[:3]:
+            column[count:] = 0
+        self.arrays = self.arrays._replace(count=count)
+
+    def judged(self, session: int) -> list[tuple[float | None, float | None]]:
+        """Of each asked pair of a session: the model's prediction before the fit, and the label; both P(second)."""
+        return self._db.execute(
+            "SELECT prediction, second FROM pairs WHERE session = ? AND collected_step IS NOT NULL ORDER BY id",
+            (session,),
+        ).fetchall()
 
     def preferred_positions(self, position: slice, equal: str = "left_out") -> tuple[np.ndarray, int]:
         """Positions of all preferred segments, ``[capacity * H, d]`` of which the first ``count`` rows are filled.
@@ -152,11 +442,11 @@ class Preferences:
         Equal pairs are left out; if there is nothing else, both their segments count. ``equal="second"``: their second
         segment counts, as by accident in the public code.
         """
-        observation, _, label, count = self.arrays
+        observation, _, second, count = self.arrays
         capacity, _, steps, _ = observation.shape
-        label = label[:count]
-        decided = (label != Preferred.EQUAL) | (equal == "second")
-        chosen = observation[:count][decided, label[decided]]
+        second = second[:count]
+        decided = (second != 0.5) | (equal == "second")
+        chosen = observation[:count][decided, (second[decided] >= 0.5).astype(int)]
         if not decided.any():
             chosen = observation[:count].reshape(-1, steps, observation.shape[-1])[:capacity]
         flat = chosen[..., position].reshape(-1, position.stop - position.start)
@@ -164,14 +454,18 @@ class Preferences:
         out[: len(flat)] = flat
         return out, len(flat)
 
+    # Looking at what was asked.
+
     def asked(self) -> list[dict[str, object]]:
         """Every asked pair without its segments, in the order of asking."""
-        names = (
-            "id, session, step, run_seed, episode_0, start_0, episode_1, start_1, scores, prediction, answered, "
-            "label, annotator, answered_step, shown_left"
-        )
-        rows = self._db.execute(f"SELECT {names} FROM pairs ORDER BY id").fetchall()
-        return [dict(zip(names.split(", "), row, strict=True)) for row in rows]
+        rows = self._db.execute(f"SELECT {', '.join(PAIR)} FROM pairs ORDER BY id").fetchall()
+        return [dict(zip(PAIR, row, strict=True)) for row in rows]
+
+    @property
+    def skipped(self) -> int:
+        """Pairs that were answered with a skip and collected."""
+        condition = "collected_step IS NOT NULL AND second IS NULL"
+        return self._db.execute(f"SELECT COUNT(*) FROM pairs WHERE {condition}").fetchone()[0]
 
     def segments(self, number: int) -> Pairs:
         """The two segments of one asked pair, as they were when asked; one row."""
@@ -189,19 +483,6 @@ class Preferences:
             np.array([row[3:5]]),
             np.array([row[5:7]]),
         )
-
-    def _read(self) -> None:
-        """Fill the arrays from the file."""
-        steps, o, a = self._shape
-        labelled = "SELECT observation, action, label FROM pairs WHERE label IS NOT NULL ORDER BY id"
-        count = 0
-        for count, (observation, action, label) in enumerate(self._db.execute(labelled), start=1):
-            self.arrays.observation[count - 1] = _array(observation, (2, steps, o))
-            self.arrays.action[count - 1] = _array(action, (2, steps, a))
-            self.arrays.label[count - 1] = label
-        for column in self.arrays[:3]:
-            column[count:] = 0
-        self.arrays = self.arrays._replace(count=count)
 
 
 def _blob(array: np.ndarray) -> bytes:

@@ -11,6 +11,7 @@ from pathlib import Path
 from senior import parts, rundir
 from senior.checks import check
 from senior.config import Config, load
+from senior.label.serving import Address, check_installed
 from senior.learner import Learner
 from senior.loop import Watcher
 from senior.runs import Lift, prepare_device
@@ -18,6 +19,9 @@ from senior.shape import shape
 from senior.together import Pools, Result, Waiting, train_waiting, unopened
 from senior.trainee import Trainee, make_environment
 from senior.types import BadInput, EnvSpec
+
+HERE = Address()
+"""The labelling page's address, where nothing is said about it: on this machine."""
 
 
 class Quiet:
@@ -40,6 +44,7 @@ def train(
     lift: Lift | None = None,
     workers: int | None = None,
     runs_per_device: int | None = None,
+    page: Address = HERE,
 ) -> list[Result]:
     """Train ``seeds`` runs (seeds ``config.seed``, +1, ...) in one program, each in ``out/seed-N``.
 
@@ -49,7 +54,7 @@ def train(
         raise BadInput(f"--seeds must be at least 1, not {seeds}.")
     configs = [replace(config, seed=config.seed + number) for number in range(seeds)]
     runs = [(own, Path(out) / f"seed-{own.seed}") for own in configs]
-    return train_all(runs, watcher, lift, workers, runs_per_device)
+    return train_all(runs, watcher, lift, workers, runs_per_device, page)
 
 
 def train_all(
@@ -58,6 +63,7 @@ def train_all(
     lift: Lift | None = None,
     workers: int | None = None,
     runs_per_device: int | None = None,
+    page: Address = HERE,
 ) -> list[Result]:
     """Train runs of any configurations, each in its directory, on one device.
 
@@ -70,6 +76,7 @@ def train_all(
     workers: processes that the environments live in; 0: this one; None: as many as there are processors on a GPU,
         but not more than runs, and 0 on a CPU.
     runs_per_device: how many are trained at a time; None: as many as the memory holds.
+    page: where people, if they are the teacher, are asked; what each run's page is opened by is told to ``watcher``.
 
     Returns one `Result` per run, in order; where there are several, one that cannot be opened is told in its own.
     Raises `BadInput` before anything is written if a configuration makes no sense, an environment does not fit, or a
@@ -80,6 +87,8 @@ def train_all(
     _check_machine(workers, runs_per_device)
     for config, _ in runs:
         check(config)
+        if config.teacher == "human":
+            check_installed()
     if len({config.device for config, _ in runs}) > 1:
         raise BadInput("All runs of a program are on one device, so their --device must be the same.")
     if len({path.resolve() for _, path in runs}) < len(runs):
@@ -96,11 +105,14 @@ def train_all(
             trainees.append(Trainee(own, path, learner, spec, pools.worker(learner)))
         for trainee in trainees:
             trainee.directory.check_free()
-            trainee.reset(0)
+            if not trainee.filmed:
+                trainee.reset(0)
         for trainee in trainees:
             trainee.directory.create(trainee.config, rundir.protocol(trainee.spec, device))
+            if trainee.filmed:  # into that directory
+                trainee.reset(0)
         waiting = [Waiting(trainee, trainee.begin) for trainee in trainees]
-        return train_waiting(waiting, watcher, lift, runs_per_device, alone=len(runs) == 1)
+        return train_waiting(waiting, watcher, lift, runs_per_device, len(runs) == 1, page)
 
 
 def _check_machine(workers: int | None, runs_per_device: int | None) -> None:
@@ -129,12 +141,13 @@ def resume(
     watcher: Watcher | None = None,
     workers: int | None = None,
     runs_per_device: int | None = None,
+    page: Address = HERE,
 ) -> list[Result]:
     """Continue an interrupted run, or every run under a directory that is not finished.
 
     Runs of one shape that stand at the same step go on in one program. One that cannot go on is told, and the others
-    do. ``workers``, ``runs_per_device``: see `train_all`. Raises `BadInput` if there is no run, or the only one cannot
-    go on.
+    do. ``workers``, ``runs_per_device``, ``page``: see `train_all`. Raises `BadInput` if there is no run, or the only
+    one cannot go on.
     """
     _check_machine(workers, runs_per_device)
     watcher = watcher or Quiet()
@@ -161,7 +174,7 @@ def resume(
                 continue
             _compare_protocol(trainee, device, watcher)
             waiting.append(Waiting(trainee, partial(trainee.resume, watcher.say)))
-        return results + train_waiting(waiting, watcher, None, runs_per_device, alone=len(found) == 1)
+        return results + train_waiting(waiting, watcher, None, runs_per_device, len(found) == 1, page)
 
 
 def find_runs(path: Path | str) -> list[Path]:

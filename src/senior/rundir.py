@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 from tensorboardX import SummaryWriter
 
-from senior.checkpoint import Damaged, pack, unpack, write_atomically
 from senior.config import Config, to_json
 from senior.envs import metaworld
+from senior.files import Damaged, pack, unpack, write_atomically
 from senior.types import BadInput, EnvSpec
 
 try:
@@ -91,6 +91,11 @@ class RunDirectory:
     def preferences(self) -> Path:
         return self.path / "preferences.sqlite"
 
+    @property
+    def films(self) -> Path:
+        """Where episodes are filmed that could not be lived through again."""
+        return self.path / "label" / "live"
+
     def check_free(self) -> None:
         """`BadInput` if there is something in its place."""
         with told(self.path):
@@ -146,6 +151,12 @@ class RunDirectory:
         """Keep what befell this machine and not the run: a worker that was replaced."""
         with open(self.path / "workers.log", "a") as file:
             file.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {sentence}\n")
+
+    def tell(self, status: Mapping[str, Any]) -> None:
+        """What the run is doing now, for the labelling page. It need not outlive a crash of the machine."""
+        new = self.path / "status.json.tmp"
+        new.write_text(json.dumps(status))
+        os.replace(new, self.path / "status.json")
 
     def lengths(self) -> dict[str, int]:
         """Bytes in every append-only file, which are then on the disk."""

@@ -1,11 +1,13 @@
 """A session of Algorithm 1: choose pairs of segments, ask about them, fit the reward model to the answers.
 
-Host code.
+Host code. `ask` puts the pairs, `listen` takes down what the teacher has said since, `learn` fits once all is
+answered: at once where a teacher answers at once, else later. A session that is in the preference file already, because
+a run that went on after it was killed comes to it again, is not chosen anew: what was said of it still holds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -20,12 +22,27 @@ Warn = Callable[[str, str | None], None]
 """Tells a warning of a kind, if there is one."""
 
 
-def hold(trainee: Trainee, runs: Runs, i: int, step: int, n: int, warn: Warn) -> str | None:
-    """Ask ``n`` pairs in run ``i`` of ``runs``, and learn from the answers; put off where there are no episodes yet.
+def ask(trainee: Trainee, runs: Runs, i: int, step: int, n: int, warn: Warn) -> bool:
+    """Put ``n`` pairs of run ``i`` of ``runs`` into its preference file; False: put off, there are no episodes yet."""
+    progress, preferences = trainee.progress, trainee.preferences
+    if not preferences.session(progress.sessions):
+        chosen = _choose(trainee, runs, i, step, n, warn)
+        if chosen is None:
+            return False
+        query, reserves = chosen
+        sides = trainee.rng(Purpose.SIDES, step).integers(2, size=len(query.pairs))
+        actions = np.asarray(runs.view(i, lambda run: run.replay.facts.action))
+        episodes = trainee.episodes_of(query.pairs, actions)
+        preferences.add(query, progress.sessions, step, trainee.config.seed, sides, reserves, episodes)
+    trainee.put.clear()
+    progress.sessions += 1
+    progress.queried += n
+    return True
 
-    Returns None, or in a sentence why the run cannot go on; then nothing was asked.
-    """
-    learner, progress, preferences = trainee.learner, trainee.progress, trainee.preferences
+
+def _choose(trainee: Trainee, runs: Runs, i: int, step: int, n: int, warn: Warn) -> tuple[Query, int] | None:
+    """Pairs to ask, best first, and how many of them are only in reserve."""
+    learner, progress = trainee.learner, trainee.progress
     drawn = trainee.candidate_starts(step)
     if drawn is None:
         warn(
@@ -44,52 +61,65 @@ def hold(trainee: Trainee, runs: Runs, i: int, step: int, n: int, warn: Warn) ->
     def predict(observation: np.ndarray, action: np.ndarray) -> np.ndarray:
         return np.asarray(runs.one(i, learner.summed_rewards, observation, action))
 
-    informed = progress.labels > 0
-    rule = trainee.rule if informed and trainee.rule else parts.first_selection()
-    labelled = preferences.arrays.observation[: progress.labels]
+    rule = trainee.rule if progress.labels and trainee.rule else parts.first_selection()
+    labelled = trainee.preferences.arrays.observation[: progress.labels]
     context = Context(pool, predict, trainee.spec, length_scale, labelled)
-    chosen = rule(trainee.rng(Purpose.SELECT, step), context, n)
+    reserves = n if trainee.config.asking.replace_skipped else 0
+    chosen = rule(trainee.rng(Purpose.SELECT, step), context, n + reserves)
     before = predict(pool.observation, pool.action).mean(axis=0)[chosen.index]
-    query = Query(pool.take(chosen.index), chosen.scores, probability_second(before), trainee.reward_per_step())
+    return Query(pool.take(chosen.index), chosen.scores, probability_second(before)), reserves
 
-    sides = trainee.rng(Purpose.SIDES, step).integers(2, size=n)
-    ids = preferences.add(query, progress.sessions, step, trainee.config.seed, sides)
-    trainee.teacher.ask(ids, query)
-    answers = trainee.teacher.collect()
-    if sorted(answers.ids) != ids or not set(answers.labels) <= {None, *map(int, Preferred)}:
-        preferences.truncate(ids[0] - 1)
-        return (
-            f"The teacher {trainee.config.teacher} must answer every pair at once, by first (0), second (1), "
-            "equal (-1) or a skip (None)."
-        )
-    preferences.answer(answers, trainee.config.teacher, step)
-    progress.sessions += 1
-    progress.queried += n
+
+def listen(trainee: Trainee) -> str | None:
+    """Ask what was not yet asked of the session under way, and write down what the teacher has said.
+
+    Returns None, or in a sentence why the run cannot go on.
+    """
+    session, preferences = trainee.progress.collected, trainee.preferences
+    while True:
+        waiting = preferences.unanswered(session, trainee.rules)
+        if new := [number for number in waiting if number not in trainee.put]:
+            trainee.put.update(new)
+            trainee.teacher.ask(new, preferences.query(new, trainee.reward_per_step()))
+        answers = trainee.teacher.collect()
+        if not answers.ids:
+            return None
+        once = len(set(answers.ids)) == len(answers.ids) == len(answers.labels)
+        if not (once and set(answers.ids) <= set(waiting) and set(answers.labels) <= {None, *map(int, Preferred)}):
+            return (
+                f"The teacher {trainee.config.teacher} must answer pairs that it was asked, each once, by first (0), "
+                "second (1), equal (-1) or a skip (None)."
+            )
+        preferences.answer(answers, trainee.config.teacher)
+
+
+def learn(trainee: Trainee, runs: Runs, i: int, step: int, warn: Warn) -> None:
+    """Collect the session under way, all of which is answered, and fit the reward model to all labels so far."""
+    learner, progress, preferences = trainee.learner, trainee.progress, trainee.preferences
+    informed = progress.labels > 0
+    preferences.collect(progress.collected, step, trainee.rules)
+    _judge_predictions(progress, preferences.judged(progress.collected), informed, warn)
+    progress.collected += 1
     progress.labels = preferences.arrays.count
-
-    said = dict(zip(answers.ids, answers.labels, strict=True))
-    _judge_predictions(progress, query, [said[number] for number in ids], informed, warn)
     if progress.labels:
         at = np.int32(step)
         info = runs.one(i, learner.fit, trainee.labelled(), at)
         progress.latest.update({name: float(value) for name, value in info.items()})
         positions, count = preferences.preferred_positions(trainee.spec.position, trainee.config.pge.equal)
         runs.one(i, learner.on_session, positions, np.int32(count), at)
-    return None
 
 
 def _judge_predictions(
-    progress: Progress, query: Query, labels: Sequence[int | None], informed: bool, warn: Warn
+    progress: Progress, judged: list[tuple[float | None, float | None]], informed: bool, warn: Warn
 ) -> None:
-    """Prospective accuracy: the model's prediction of new pairs before it is fitted to them.
+    """Prospective accuracy: the model's prediction of new pairs before it is fitted to them, against the labels.
 
     ``informed``: it had been fitted to some before.
     """
-    assert query.prediction is not None
     decided = [
-        (probability > 0.5) == (label == Preferred.SECOND)
-        for probability, label in zip(query.prediction, labels, strict=True)
-        if label in (Preferred.FIRST, Preferred.SECOND)
+        (prediction > 0.5) == (second > 0.5)
+        for prediction, second in judged
+        if prediction is not None and second not in (None, 0.5)
     ]
     if not decided:
         return

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -14,6 +15,7 @@ import numpy as np
 
 from senior import checkpoint, rundir
 from senior.envs.workers import Worker, Workers
+from senior.label.serving import Address, Serving
 from senior.learner import Learner, Run
 from senior.loop import Training, Watcher
 from senior.report.curves import learning_curve
@@ -105,15 +107,26 @@ class _Together:
 
 
 def train_waiting(
-    waiting: Sequence[Waiting], watcher: Watcher, lift: Lift | None, runs_per_device: int | None, alone: bool
+    waiting: Sequence[Waiting],
+    watcher: Watcher,
+    lift: Lift | None,
+    runs_per_device: int | None,
+    alone: bool,
+    page: Address,
 ) -> list[Result]:
     """Train runs, as many at a time as there is room for.
 
-    alone: one that cannot be opened ends it all, for there is no other.
+    alone: one that cannot be opened ends it all, for there is no other. page: where people, if they are the teacher,
+    are asked.
     """
     results: dict[Path, Result] = {}
     left = sorted(waiting, key=lambda run: run.trainee.config.device)
+    pages = ExitStack()
     try:
+        for trainee, _ in waiting:
+            if trainee.config.teacher == "human":
+                trainee.tell("starting", 0)
+                pages.enter_context(Serving(trainee.directory.path, page, watcher.say))
         while left and not (results and watcher.stop):
             device = left[0].trainee.config.device
             how = lift or lift_for(device)
@@ -127,6 +140,7 @@ def train_waiting(
     finally:
         for trainee, _ in left:
             trainee.close()
+        pages.close()
     return [results[run.path] for run in waiting]
 
 
@@ -201,6 +215,7 @@ def _finish(trainee: Trainee) -> Result:
     """The learning curve, and what there is to say of a run."""
     progress, directory = trainee.progress, trainee.directory.path
     finished = trainee.failure is None and progress.step == trainee.config.steps
+    trainee.tell("finished" if finished else "stopped", progress.step)
     if finished:
         learning_curve(directory)
     return Result(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -10,15 +12,16 @@ from typing import Any
 import numpy as np
 
 from senior import checkpoint, envs, parts
-from senior.config import Config
-from senior.envs.episodes import EVALUATION, TRAINING, Episodes, Failure, Local, Step, restore
+from senior.config import Config, made_by
+from senior.envs.episodes import EVALUATION, TRAINING, Episodes, Failure, Local, Step, episode_seed, restore
+from senior.envs.recording import Recording, repeats_itself
 from senior.envs.workers import Remote, Worker
 from senior.learner import Learner, Purpose, Run
-from senior.preferences import Preferences
+from senior.preferences import Preferences, Rules
 from senior.reward.bilevel import FirstSteps
 from senior.reward.model import Labelled
 from senior.rundir import RunDirectory, told
-from senior.types import BadInput, EnvSpec
+from senior.types import BadInput, EnvSpec, Pairs
 
 
 @dataclass
@@ -29,11 +32,11 @@ class Progress:
     evaluated: int = 0  # the step of the last evaluation
     snapped: int = 0  # and of the last snapshot
     written: int = 0  # facts that are in chunks on the disk
-    last_pair: int = 0  # number of the last row of the preference file
     queried: int = 0
     labels: int = 0
     success: float | None = None  # of the last evaluation
-    sessions: int = 0
+    sessions: int = 0  # that were asked
+    collected: int = 0  # of those, that were answered and learned from
     outer_steps: int = 0
     refreshes: int = 0
     pretraining_updates: int = 0
@@ -59,17 +62,6 @@ def make_environment(config: Config) -> tuple[Any, EnvSpec]:
     return envs.make(**made_by(config))
 
 
-def made_by(config: Config) -> dict[str, Any]:
-    """What `senior.envs.make` makes that environment from."""
-    return {
-        "task": None if config.env else config.task,
-        "env": config.env,
-        "position": config.position,
-        "length_scale": config.length_scale,
-        "horizon": config.horizon,
-    }
-
-
 class Trainee:
     """One run, as its host sees it. `begin` or `resume` gives it its state."""
 
@@ -84,16 +76,32 @@ class Trainee:
         self.progress = Progress()
         self.failure: str | None = None
         self.done = False
-        self.environment = self._place(TRAINING, worker)
+        self.filmed = self._must_be_filmed()
+        self.environment = self._film() if self.filmed else self._place(TRAINING, worker)
         self.judged_in = self._place(EVALUATION, worker)
         self.rule = parts.selection(config) if config.method.learns_reward else None
         self.teacher = parts.teacher(config)
+        asking = config.asking
+        self.rules = Rules(asking.overlap, asking.replace_skipped, asking.soft_labels)
+        self._told: tuple[str, float, int] = ("", 0.0, 0)  # phase, time and step of what people were told last
+        self.put: set[int] = set()  # pairs of the session under way that were put to the teacher
         self._preferences: Preferences | None = None
 
     def _place(self, purpose: int, worker: Worker | None) -> Episodes:
         if worker is None:
             return Local(lambda: make_environment(self.config), self.config.seed, purpose)
         return Remote(worker, made_by(self.config), self.spec, self.config.seed, purpose)
+
+    def _must_be_filmed(self) -> bool:
+        """Whether people can only see what happened if it is filmed when it does: see `senior.envs.recording`."""
+        if self.config.teacher != "human" or self.config.env is None:
+            return False
+        return self.directory.films.exists() or not repeats_itself(lambda: make_environment(self.config))
+
+    def _film(self) -> Episodes:
+        """The training environment, in this process, filmed."""
+        local = Local(lambda: envs.make(**made_by(self.config), render=True), self.config.seed, TRAINING)
+        return Recording(local, self.directory.films, self.config.window)
 
     @property
     def name(self) -> str:
@@ -127,7 +135,7 @@ class Trainee:
     def begin(self) -> Run:
         """A new run in a directory made for it, whose environment stands at its first step (`reset`)."""
         self.directory.forget_everything()
-        self._open_preferences(0)
+        self._open_preferences()
         return self.learner.init(self.config)
 
     def stand(self, progress: dict[str, Any] | None) -> None:
@@ -159,22 +167,30 @@ class Trainee:
         self.stand(progress)
         self.progress.written = int(run.replay.count)  # the checkpoint was made before its own chunk was counted
         self.directory.truncate(self.progress.lengths, step)
-        self._open_preferences(self.progress.last_pair)
+        self._open_preferences()
         self._relive(run)
         return run
 
-    def _open_preferences(self, last: int) -> None:
-        """Open the preference file with pairs up to number ``last``. Plain SAC asks nothing and has none."""
+    def _open_preferences(self) -> None:
+        """Open the preference file with the labels that were learned from. Plain SAC asks nothing and has none.
+
+        Sessions that it holds beyond are kept: the run will come to them, and to the answers that were given.
+        """
         if self.config.method.learns_reward:
-            self.preferences.truncate(last)
+            self.preferences.read(self.progress.collected)
 
     def _relive(self, run: Run) -> None:
         """Bring the environment to where the run stands, by the running episode's seed and actions.
 
-        An environment that does not repeat itself is found out on the way. Where no episode is running, the latest
+        An environment that is filmed goes on with another episode instead. Any other that does not repeat itself is found out on the way. Where no episode is running, the latest
         one is lived through again for that.
         """
         progress, count = self.progress, int(run.replay.count)
+        if self.filmed:  # it cannot be lived through again: the episode that was running is broken off
+            progress.episode += bool(progress.elapsed)
+            progress.elapsed, progress.episode_return, progress.episode_success = 0, 0.0, None
+            self.reset(progress.episode)
+            return
         episode, rows = progress.episode, np.arange(count - progress.elapsed, count)
         latest = progress.recent[-1:]
         if not progress.elapsed and latest and latest[0][1] >= count - run.replay.capacity:
@@ -203,8 +219,29 @@ class Trainee:
         progress = self.progress
         progress.step = step
         progress.lengths = self.directory.lengths()
-        progress.last_pair = self.preferences.last if self.config.method.learns_reward else 0
         progress.written = checkpoint.save(self.directory.checkpoints, step, run, asdict(progress), progress.written)
+
+    def tell(self, phase: str, step: int) -> None:
+        """Tell people, where they are the teacher, what the run is doing; twice a second at most.
+
+        phase: starting, pretraining, training, waiting (for answers), evaluating, finished or stopped.
+        """
+        now = time.time()
+        if self.config.teacher != "human" or (phase == self._told[0] and now - self._told[1] < 0.5):
+            return
+        _, last, at = self._told
+        rate = (step - at) / (now - last) if step > at and last else None
+        self._told = phase, now, step
+        self.directory.tell(
+            {
+                "phase": phase,
+                "step": step,
+                "steps": self.config.steps,
+                "steps_per_second": rate,
+                "failure": self.failure,
+                "process": os.getpid(),
+            }
+        )
 
     def close(self) -> None:
         """Close environments and files."""
@@ -274,6 +311,26 @@ class Trainee:
         start = rng.integers(length[drawn] - queries.segment)
         return (first[drawn] + start).astype(np.int32), episode[drawn], start
 
+    def episodes_of(self, pairs: Pairs, actions: np.ndarray) -> dict[int, tuple[int, np.ndarray]]:
+        """Seed and actions [n, a] of every episode that pairs were cut from; ``actions``: the replay's."""
+        found = {}
+        rows = {episode: (first, length) for episode, first, length in self.progress.recent}
+        for episode in np.unique(pairs.episode).tolist():
+            first, length = rows[episode]
+            seed = episode_seed(self.config.seed, TRAINING, episode)
+            found[episode] = seed, actions[np.arange(first, first + length) % self.config.capacity]
+        return found
+
+    @property
+    def waits(self) -> bool:
+        """Whether a session was asked that is not yet learned from."""
+        return self.progress.collected < self.progress.sessions
+
+    def answered(self, step: int) -> bool:
+        """Whether the session under way can be learned from at ``step``."""
+        settle = self.config.asking.settle if self.config.teacher == "human" else 0.0
+        return self.preferences.ready(self.progress.collected, step, self.rules, settle)
+
     def evaluation_episodes(self, step: int) -> range:
         """Numbers of the episodes of the evaluation at ``step``; no two evaluations share one."""
         every, count = self.config.evaluation.every, self.config.evaluation.episodes
@@ -297,17 +354,17 @@ class Trainee:
 
     def labelled(self) -> Labelled:
         """All labels so far, in arrays of the budget's size."""
-        observation, action, label, count = self.preferences.arrays
-        return Labelled(observation, action, label, np.int32(count))  # pyright: ignore[reportArgumentType]
+        observation, action, second, count = self.preferences.arrays
+        return Labelled(observation, action, second, np.int32(count))  # pyright: ignore[reportArgumentType]
 
     def latest_pairs(self) -> FirstSteps:
         """First steps of the M most recent labelled pairs, for the outer step."""
-        observation, action, label, count = self.preferences.arrays
+        observation, action, second, count = self.preferences.arrays
         m = self.config.queries.per_session
         rows = np.arange(count - m, count)
         weight = (rows >= 0).astype(np.float32)
         rows = np.maximum(rows, 0)
-        return FirstSteps(observation[rows, :, 0], action[rows, :, 0], label[rows], weight)  # pyright: ignore[reportArgumentType]
+        return FirstSteps(observation[rows, :, 0], action[rows, :, 0], second[rows], weight)  # pyright: ignore[reportArgumentType]
 
 
 def policy_arrays(run: Run) -> dict[str, np.ndarray]:

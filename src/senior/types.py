@@ -90,7 +90,7 @@ class Pairs(NamedTuple):
 
 
 class Preferred(IntEnum):
-    """An answer as stored. A skipped pair is an asked pair without a label, so it is not one of these."""
+    """An answer as stored; a skipped pair has none of them."""
 
     FIRST = 0
     SECOND = 1

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from senior.agent import sac
 from senior.agent.networks import MLP, Arithmetic, descend
@@ -26,7 +26,7 @@ class FirstSteps(NamedTuple):
 
     observation: Float[Array, "m 2 o"]
     action: Float[Array, "m 2 a"]
-    label: Int[Array, " m"]
+    second: Float[Array, " m"]  # P(second preferred)
     weight: Float[Array, " m"]  # 1 where the row holds a pair, 0 where it is padding
 
 
@@ -62,9 +62,9 @@ def outer_loss(
 
     gradient = jax.grad(inner_loss)(critics)
     virtual = jax.tree.map(lambda parameter, step: parameter - numbers.inner_rate * step, critics, gradient)
-    m = pairs.label.shape[0]
+    m = pairs.second.shape[0]
     q = sac.values(virtual, pairs.observation.reshape(2 * m, -1), pairs.action.reshape(2 * m, -1), arithmetic)
-    losses = cross_entropy(q.reshape(2, m, 2), targets(pairs.label))  # [critic, pair]
+    losses = cross_entropy(q.reshape(2, m, 2), targets(pairs.second))  # [critic, pair]
     return numbers.weight * jnp.sum(losses @ pairs.weight) / jnp.maximum(pairs.weight.sum(), 1)
 
 

@@ -15,10 +15,12 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from senior.agent.networks import MLP, adam, apply_mlp, descend, fan_in_uniform, init_mlp
-from senior.types import Preferred
 
 PART = 32
 """Pairs whose gradient is computed at a time; those of a mini-batch are added up. A fit costs what its labels cost."""
+
+EQUAL = 0.5
+"""P(second preferred) of a pair called equal. Such a pair counts in the loss and not in the accuracy."""
 
 FARTHEST = 10.0
 """Deviations beyond which a standardised entry is cut off: what hardly moved so far may move at last."""
@@ -56,7 +58,7 @@ class Labelled(NamedTuple):
 
     observation: Float[Array, "n 2 H o"]
     action: Float[Array, "n 2 H a"]
-    label: Int[Array, " n"]
+    second: Float[Array, " n"]  # P(second preferred)
     count: Int[Array, ""]
 
 
@@ -113,9 +115,8 @@ def rewards(
     return jax.vmap(member_reward, in_axes=(0, None, None, None))(members, observation, action, scaling)
 
 
-def targets(label: Int[Array, " n"]) -> Float[Array, "n 2"]:
+def targets(second: Float[Array, " n"]) -> Float[Array, "n 2"]:
     """(1, 0) where the first is preferred, (0, 1) where the second is, (0.5, 0.5) where they are equal."""
-    second = jnp.where(label == Preferred.EQUAL, 0.5, label.astype(jnp.float32))
     return jnp.stack([1 - second, second], axis=-1)
 
 
@@ -141,14 +142,14 @@ def fit(
     taken per mini-batch. The fit ends after an epoch whose accuracy, measured while it was trained, exceeds
     ``stop_accuracy``. With no label nothing changes. Shapes do not depend on the number of labels.
     """
-    capacity = labelled.label.shape[0]
+    capacity = labelled.second.shape[0]
     batch = min(batch, capacity)
     part = min(PART, batch)
     count = labelled.count
     n_members = model.members.weights[0].shape[0]
     scaling = model.scaling
-    target = targets(labelled.label)
-    decided = jnp.sum((labelled.label != Preferred.EQUAL) & (jnp.arange(capacity) < count))
+    target = targets(labelled.second)
+    decided = jnp.sum((labelled.second != EQUAL) & (jnp.arange(capacity) < count))
 
     def loss_of(
         members: MLP, rows: Int[Array, "m b"], weight: Float[Array, " b"], key: PRNGKeyArray
@@ -158,8 +159,8 @@ def fit(
         def of_member(member: MLP, own: Int[Array, " b"], key: PRNGKeyArray) -> tuple[Array, Array]:
             reward = member_reward(member, labelled.observation[own], labelled.action[own], scaling)
             logits = window_sums(reward, snippets, key) if snippets else reward.sum(axis=-1)[:, None]  # [b, copies, 2]
-            right = (logits[..., 1] > logits[..., 0]) == (labelled.label[own] == Preferred.SECOND)[:, None]
-            counted = right.mean(axis=1) * ((weight > 0) & (labelled.label[own] != Preferred.EQUAL))
+            right = (logits[..., 1] > logits[..., 0]) == (labelled.second[own] > EQUAL)[:, None]
+            counted = right.mean(axis=1) * ((weight > 0) & (labelled.second[own] != EQUAL))
             losses = cross_entropy(logits, target[own][:, None]).mean(axis=1)
             return jnp.sum(losses * weight), counted.sum()
 

@@ -1,4 +1,4 @@
-"""Who answers. ``ask`` and ``collect`` are two calls, for people take their time; as yet, all must answer at once.
+"""Who answers. ``ask`` and ``collect`` are two calls, for people take their time.
 
 A teacher is a new file here and a line in `TEACHERS`; a third party's is named ``module:Name`` and built without
 arguments.
@@ -13,6 +13,7 @@ from senior.types import Answers, Query
 
 TEACHERS = {
     **dict.fromkeys(scripted.TEACHERS, "senior.teachers.scripted:Scripted"),
+    "human": "senior.teachers.human:Human",
 }
 
 
@@ -24,5 +25,5 @@ class Teacher(Protocol):
         ...
 
     def collect(self) -> Answers:
-        """One answer to every pair asked since the last call."""
+        """What was answered since the last call, perhaps nothing yet; it is called again until all is."""
         ...

@@ -1,0 +1,56 @@
+"""Files that are whole or absent, and arrays in them. Imports no JAX.
+
+Written to a temporary name, synced and renamed. ``.npz`` members carry checksums, which reading verifies. Nothing is
+pickled.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+
+class Damaged(Exception):
+    """A file that cannot be used; the text names it and says why."""
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """The whole file or none of it, on the disk when this returns."""
+    temporary = path.with_name(path.name + ".tmp")
+    with open(temporary, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+    directory = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(directory)
+    finally:
+        os.close(directory)
+
+
+def pack(arrays: dict[str, np.ndarray], compress: bool = False) -> bytes:
+    """Arrays as the bytes of an ``.npz`` file."""
+    buffer = io.BytesIO()
+    (np.savez_compressed if compress else np.savez)(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def unpack(path: Path) -> dict[str, np.ndarray]:
+    """Read an ``.npz`` file whole, checksums included; `Damaged` if that fails.
+
+    A member's checksum is verified before its bytes are parsed. Damage makes the decompressor and the parser fail
+    in more ways than can be listed, so any failure counts.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:
+            members = {name.removesuffix(".npy"): file.read(name) for name in file.namelist()}
+        return {
+            name: np.lib.format.read_array(io.BytesIO(member), allow_pickle=False) for name, member in members.items()
+        }
+    except Exception as error:
+        raise Damaged(f"{path.name} is damaged ({error})") from error

@@ -1,0 +1,156 @@
+"""The labelling page's server: ``python -m senior.label.server RUN``, beside the run directory. Imports no JAX.
+
+It serves what `senior.label.desk` keeps, and the clips that `senior.label.clips` draws in a process of its own. Nothing
+but ``/health`` is told without the token of the printed address, which becomes a strict cookie. One server serves a
+run at a time; its address outlives it in ``RUN/label/``, so that a page which lost it finds the next one.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import re
+import secrets
+import socket
+import sys
+import time
+from contextlib import closing, suppress
+from pathlib import Path
+
+import uvicorn
+
+from senior.config import Config, load
+from senior.label.app import application
+from senior.label.desk import Desk
+from senior.label.guard import MOST_BYTES, Access, is_loopback
+from senior.label.serving import BAD_INPUT, SERVED, Address, Served
+from senior.label.standing import Standing
+from senior.preferences import Rules, connect
+from senior.types import BadInput
+
+FIRST_PORT = 8642
+PLAIN = re.compile(r"[A-Za-z0-9._~-]*")
+"""Tokens that stand in an address and in a cookie as they are."""
+
+
+def standing_of(run: Path, config: Config) -> Standing:
+    """What is served of a run."""
+    asking = config.asking
+    rules = Rules(asking.overlap, asking.replace_skipped, asking.soft_labels)
+    return Standing(run, config, Desk(run / "preferences.sqlite", rules))
+
+
+def access_to(address: Address, port: int, token: str) -> Access:
+    """Who is let in at an address."""
+    local = is_loopback(address.host)
+    names = {"127.0.0.1", "::1"} if local else {address.host.lower(), socket.gethostname().lower()}
+    allowed = {name.lower() for name in address.allowed_hosts}
+    return Access(token, f"senior-{port}", frozenset({"localhost", *names, *allowed}), anywhere=not local)
+
+
+def _token(folder: Path, wanted: str | None) -> str:
+    """The token that is asked for, else that of the run's last server, else a new one; only its owner can read it."""
+    file, token = folder / "token", wanted
+    if token is None:
+        with suppress(OSError, UnicodeDecodeError):
+            token = file.read_text().strip()
+        if not token or not PLAIN.fullmatch(token):
+            token = secrets.token_urlsafe(24)
+    with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as opened:
+        os.fchmod(opened.fileno(), 0o600)  # it may have been there
+        opened.write(token)
+    return token
+
+
+def _bind(address: Address, before: int | None) -> socket.socket:
+    """A listening socket: on the wanted port, else on that of the run's last server, else on the first that is free."""
+    family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
+    ports = [address.port] if address.port else [*([before] if before else []), *range(FIRST_PORT, FIRST_PORT + 50), 0]
+    for port in ports:
+        listening = socket.socket(family)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listening.bind((address.host, port))
+            listening.listen(128)
+            return listening
+        except UnicodeError as error:
+            listening.close()
+            raise BadInput(f"Cannot listen on {address.host}: that is no address.") from error
+        except OSError as error:
+            listening.close()
+            if address.port or error.errno != errno.EADDRINUSE:
+                raise BadInput(f"Cannot listen on {address.host}, port {port}: {error.strerror or error}.") from error
+    raise BadInput(f"No port is free on {address.host}.")
+
+
+def serve(run: Path, address: Address, owner: str) -> Served:
+    """Serve a run until SIGINT or SIGTERM. Where another process serves it already, returns at once where that is."""
+    folder = run / "label"
+    config = load(run / "config.json")
+    if not config.method.learns_reward:
+        raise BadInput(f"The run in {run} learns from the true reward; nobody is asked anything.")
+    if address.token and not PLAIN.fullmatch(address.token):
+        raise BadInput("Only letters from A to Z, digits and . _ ~ - can stand in a token.")
+    if address.token == "" and not is_loopback(address.host):
+        raise BadInput(f"Without a token the page can only be served to this machine, not on {address.host}.")
+    (folder / "clips").mkdir(parents=True, exist_ok=True)
+    lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(lock)
+        return Served.read(run)
+    before = Served.find(run)
+    (folder / "server.json").unlink(missing_ok=True)  # of a server that is gone
+    token = _token(folder, address.token)
+    while not _has_tables(run / "preferences.sqlite"):
+        time.sleep(0.2)
+    listening = _bind(address, before.port if before else None)
+    port = listening.getsockname()[1]
+    served = Served(_shown_host(address.host), port, token, os.getpid(), owner)
+    served.write(run)
+    print(served.url, flush=True)
+    serving = uvicorn.Config(
+        application(standing_of(run, config), access_to(address, port, token)),
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=1,
+        h11_max_incomplete_event_size=MOST_BYTES,
+    )
+    uvicorn.Server(serving).run(sockets=[listening])
+    os.close(lock)
+    return served
+
+
+def _has_tables(path: Path) -> bool:
+    """Whether the trainer has made the preference file. Raises `BadInput` if it cannot be read."""
+    if not path.exists() or path.stat().st_size == 0:
+        return False
+    with closing(connect(path)) as db:
+        return db.execute("PRAGMA user_version").fetchone()[0] > 0
+
+
+def _shown_host(host: str) -> str:
+    """The host as it stands in an address that others can open."""
+    if host in ("0.0.0.0", "::"):
+        return socket.gethostname()
+    return f"[{host}]" if ":" in host else host
+
+
+def main(arguments: list[str]) -> int:
+    """The process: its arguments are the run, and an `Address` and the owner as JSON."""
+    run, told = Path(arguments[0]), json.loads(arguments[1])
+    owner = told.pop("owner")
+    try:
+        served = serve(run, Address(**{**told, "allowed_hosts": tuple(told["allowed_hosts"])}), owner)
+    except BadInput as error:
+        print(error, file=sys.stderr)
+        return BAD_INPUT
+    return 0 if served.process == os.getpid() else SERVED
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,143 @@
+"""How a run stands, in words and numbers for the people who teach it. Imports no JAX."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from senior.config import Config
+from senior.envs.metaworld import TASKS
+from senior.label.desk import Desk
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What there is to tell of one run."""
+
+    path: Path
+    config: Config
+    desk: Desk
+
+    @property
+    def title(self) -> str:
+        """Which run it is, in a few words."""
+        return f"{self.config.env or self.config.task}, {self.config.method.name}, seed {self.config.seed}"
+
+    @property
+    def goal(self) -> str:
+        """What the robot is to do: as somebody wrote it for this run, else the task's own sentence."""
+        task = None if self.config.env else TASKS.get(self.config.task)
+        return self.desk.note("goal") or (task.sentence if task else "Reach the goal")
+
+    def state(self, annotator: str | None) -> dict[str, Any]:
+        """How everything stands, for one person."""
+        progress = self.desk.progress()
+        progress["labels"]["budget"] = self.config.queries.budget
+        people = [{"name": who["name"], "answers": who["answers"]} for who in self.desk.annotators()]
+        told = {
+            "run": self.title,
+            "goal": self.goal,
+            **progress,
+            "trainer": trainer(self.path),
+            "annotators": people,
+            "strength": True,
+        }
+        return told if annotator is None else {**told, "you": self.desk.own(annotator)}
+
+    def turn(self, annotator: str, said: dict[str, Any] | None = None) -> dict[str, Any]:
+        """The pair that somebody is to look at, or why there is none."""
+        assignment, state = self.desk.assign(annotator), self.state(annotator)
+        kind, why = assignment.kind, None
+        if kind is not None:
+            phase = state["trainer"]["phase"]
+            kind = phase if kind == "waiting" and phase in ("finished", "stopped") else kind
+            why = {
+                "drawing": "The next clips are being drawn.",
+                "others": "The pairs that are left are for others to answer.",
+                "waiting": "There is nothing to answer now. The next pairs come when training has gone on.",
+                "finished": "All is done: training has finished. Thank you.",
+                "stopped": state["trainer"]["text"],
+            }[kind]
+        return {
+            "pair": assignment.pair,
+            "ahead": assignment.ahead,
+            "kind": kind,
+            "why": why,
+            "state": state,
+            "said": said,
+        }
+
+    def overview(self) -> dict[str, Any]:
+        """Who answered, how far people agree, and how the run learns."""
+        from senior.label import agreement  # brings statistics that take seconds to import
+
+        steps, success, returns = _curve(self.path / "eval.csv")
+        prospective = self.desk.prospective()
+        return {
+            "run": self.title,
+            "goal": self.goal,
+            "agreement": agreement.summary(self.desk.said()),
+            "annotators": self.desk.annotators(),
+            "curve": {"step": steps, "success": success, "return": returns},
+            "prospective": {
+                "step": [row[0] for row in prospective],
+                "accuracy": [row[1] for row in prospective],
+                "pairs": [row[2] for row in prospective],
+            },
+        }
+
+
+def trainer(run: Path) -> dict[str, Any]:
+    """What the trainer is doing: phase and a sentence."""
+    try:
+        told = json.loads((run / "status.json").read_text())
+        phase, step, steps = told["phase"], told["step"], told["steps"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return {"phase": "starting", "text": "The run has not begun."}
+    if phase == "finished":
+        return {"phase": phase, "text": f"Training has finished, after {step:,} steps."}
+    if phase == "stopped" or not _is_alive(told.get("process")):
+        why = f" ({told['failure']})" if told.get("failure") else ""
+        text = (
+            f"Training stands still at step {step:,}{why}. Answers are kept; they are learned from when it goes on: "
+            f"senior resume {run}"
+        )
+        return {"phase": "stopped", "text": text}
+    rate = f", {told['steps_per_second']:,.0f} a second" if told.get("steps_per_second") else ""
+    words = {
+        "starting": "The run is starting.",
+        "pretraining": f"The robot is trying things out: step {step:,} of {steps:,}{rate}.",
+        "training": f"Training: step {step:,} of {steps:,}{rate}.",
+        "waiting": f"Training waits for your answers at step {step:,} of {steps:,}.",
+        "evaluating": f"The policy is being judged at step {step:,} of {steps:,}.",
+    }
+    return {"phase": phase, "text": words.get(phase, phase)}
+
+
+def _is_alive(process: Any) -> bool:
+    try:
+        os.kill(int(process), 0)
+    except PermissionError:
+        return True
+    except (OSError, ValueError, TypeError):
+        return False
+    return True
+
+
+def _curve(path: Path) -> tuple[list[int], list[float] | None, list[float]]:
+    """Steps, success rates (None if none is told) and returns of the evaluations so far."""
+    try:
+        with open(path, newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row["return_mean"]]
+        told = all(row["success_rate"] for row in rows)
+        return (
+            [int(row["step"]) for row in rows],
+            [float(row["success_rate"]) for row in rows] if told else None,
+            [float(row["return_mean"]) for row in rows],
+        )
+    except (OSError, ValueError, KeyError):  # a row that is being written
+        return [], None, []
