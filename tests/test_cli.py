@@ -15,6 +15,7 @@ import pytest
 from senior import envs, judgement, program
 from senior.cli import BAD_INPUT, COMMANDS, DONE, FAILED, main
 from senior.config import Answering, Config, to_json
+from senior.label.serving import Address
 from senior.methods import METHODS
 from senior.presets import preset, quick_changes, release
 from senior.types import BadInput
@@ -362,7 +363,13 @@ def test_options_of_the_machine_reach_the_program(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(program, name, lambda *_, **machine: asked.append(machine) or [])
     assert main(["train", "--workers", "2", "--runs-per-device", "3"]) == DONE
     assert main(["resume", "somewhere", "--workers", "0", "--runs-per-device", "auto"]) == DONE
-    assert asked == [{"workers": 2, "runs_per_device": 3}, {"workers": 0, "runs_per_device": None}]
+    page = {"page": Address()}
+    assert asked == [{"workers": 2, "runs_per_device": 3, **page}, {"workers": 0, "runs_per_device": None, **page}]
+    asked.clear()
+    where = "--host 0.0.0.0 --port 9000 --allowed-host robot --allowed-host arm --token secret"
+    assert main(["resume", "somewhere", *where.split()]) == DONE
+    assert asked[0]["page"] == Address("0.0.0.0", 9000, ("robot", "arm"), "secret")
+    assert main(["resume", "somewhere", "--port", "70000"]) == BAD_INPUT
 
 
 def trained_with(arguments: str, monkeypatch: pytest.MonkeyPatch) -> tuple[Config, Path, int]:
@@ -371,7 +378,7 @@ def trained_with(arguments: str, monkeypatch: pytest.MonkeyPatch) -> tuple[Confi
 
     def instead(config: Config, out: Path, seeds: int, watcher: Any, **machine: Any) -> list[Any]:
         asked.extend((config, out, seeds))
-        assert machine == {"workers": None, "runs_per_device": None}
+        assert machine == {"workers": None, "runs_per_device": None, "page": Address()}
         return []
 
     monkeypatch.setattr(program, "train", instead)

@@ -52,6 +52,10 @@ def third_party_imports(source: str) -> Iterator[tuple[str, bool]]:
     return ((name, deferred) for name, deferred in visit(ast.parse(source), False) if name not in ours)
 
 
+LABEL = {"label/app.py", "label/guard.py", "label/server.py"}
+"""Modules that are imported by functions only, so that they may need the extra ``label``."""
+
+
 def test_imports_are_declared():
     """A module imports dependencies only; a function may also import from an extra that users can choose."""
     always = names(PROJECT["dependencies"])
@@ -60,13 +64,36 @@ def test_imports_are_declared():
     providers = importlib.metadata.packages_distributions()
     seen, undeclared = set(), set()
     for path in (ROOT / "src").rglob("*.py"):
+        on_call = str(path.relative_to(ROOT / "src" / "senior")) in LABEL
         for name, deferred in third_party_imports(path.read_text()):
             provided_by = {canonicalize_name(provider) for provider in providers.get(name, [name])}
             seen.add(name)
-            if not provided_by & (on_demand if deferred else always):
+            if not provided_by & (on_demand if deferred or on_call else always):
                 undeclared.add(f"{path.relative_to(ROOT)}: {name}")
     assert not undeclared
     assert {"jax", "numpy"} <= seen
+
+
+def test_what_needs_an_extra_is_imported_by_functions_only():
+    """Without ``label`` installed everything else works, and asking for it says what to install."""
+    script = """
+import importlib.util, sys
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("fastapi", "starlette", "uvicorn", "jinja2", "pydantic", "statsmodels"):
+            raise ModuleNotFoundError(name)
+sys.meta_path.insert(0, Missing())
+import senior.program, senior.cli, senior.labels, senior.label.clips
+find = importlib.util.find_spec
+importlib.util.find_spec = lambda name: None if name == "fastapi" else find(name)
+code = senior.cli.main(["train", "--task", "point", "--method", "pebble", "--teacher", "human", "--out", sys.argv[1]])
+assert code == 2, code
+"""
+    out = ROOT / "runs" / "never"
+    done = subprocess.run([sys.executable, "-c", script, out], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "pip install 'senior-rl[label]'" in done.stderr
+    assert not out.exists()
 
 
 def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
@@ -76,6 +103,8 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
     assert {"senior/py.typed", f"{info}/licenses/LICENSE"} <= held
     sources = {str(path.relative_to(ROOT / "src")) for path in (ROOT / "src").rglob("*.py")}
     assert sources <= held
+    pages = {str(path.relative_to(ROOT / "src")) for path in (ROOT / "src" / "senior" / "label" / "page").iterdir()}
+    assert "senior/label/page/label.html" in pages and pages <= held
     assert not [name for name in held if "__pycache__" in name or name.endswith(".pyc")]
 
 

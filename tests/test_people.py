@@ -24,6 +24,7 @@ from senior.checkpoint import steps, unpack
 from senior.config import Asking, Config
 from senior.label.desk import Desk, Given, Side
 from senior.label.server import _has_tables
+from senior.labels import export_labels
 from senior.preferences import Rules, asked_of, connect, pairs_of
 from senior.program import resume, train
 from senior.types import BadInput
@@ -241,6 +242,24 @@ def test_with_overlap_a_pair_costs_one_of_the_budget_and_is_learned_from_by_the_
         one, other = map(int, both.split(","))
         assert second == (one + other) / 2
     assert {second for second, _ in said} >= {0.5}
+
+
+def test_a_file_of_labels_teaches_what_its_run_was_taught(oracle: Path, tmp_path: Path):
+    """The same segments, labels and steps, so the same weights; a smaller budget takes the first of them."""
+    file = tmp_path / "labels.jsonl"
+    assert export_labels(oracle, file) == 25
+    (result,) = train(short(teacher=str(file)), tmp_path / "again", watcher=Stop())
+    assert result.labels == 25
+    assert_same_learning(result.path, oracle)
+    fewer = short(teacher=str(file))
+    fewer = replace(fewer, queries=replace(fewer.queries, budget=12))
+    (result,) = train(fewer, tmp_path / "fewer", watcher=Stop())
+    assert labels(result.path) == [(row[0], row[1], row[2], row[3]) for row in labels(oracle)[:12]]
+    more = replace(fewer, queries=replace(fewer.queries, budget=26))
+    with pytest.raises(
+        BadInput, match="holds 25 answered pairs, fewer than the budget of 26; give --budget 25 or less"
+    ):
+        train(more, tmp_path / "more", watcher=Stop())
 
 
 def test_what_makes_no_sense_with_people_is_refused(tmp_path: Path):

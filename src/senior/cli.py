@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import signal
 import sys
@@ -101,6 +102,36 @@ class LabelOptions:
     run: tyro.conf.Positional[Path]
     """A run directory."""
     page: Annotated[PageOptions, tyro.conf.arg(name="")] = field(default_factory=PageOptions)
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Write all that was asked in a run and said of it into files (docs/labels.md)."""
+
+    run: tyro.conf.Positional[Path]
+    """A run directory."""
+    out: Path
+    """File to write, NAME.jsonl; the segments go to NAME.npz beside it."""
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """Put exported labels into a run of people's that has not asked anything yet."""
+
+    run: tyro.conf.Positional[Path]
+    """A run directory."""
+    file: tyro.conf.Positional[Path]
+    """NAME.jsonl, with NAME.npz beside it."""
+
+
+@dataclass(frozen=True)
+class StatsOptions:
+    """Tell who said what in a run, and how far people agree."""
+
+    run: tyro.conf.Positional[Path]
+    """A run directory."""
+    json: bool = False
+    """Print JSON."""
 
 
 @dataclass(frozen=True)
@@ -299,6 +330,43 @@ def _label(arguments: list[str]) -> int:
     return DONE
 
 
+def _labels(arguments: list[str]) -> int:
+    actions = {"export": _export, "import": _import, "stats": _stats}
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print("usage: senior labels export|import|stats RUN ...\n\nsenior labels export --help tells its options.")
+        sys.exit(DONE)
+    if arguments[0] not in actions:
+        raise BadInput.unknown("action of senior labels", arguments[0], actions)
+    return actions[arguments[0]](arguments[1:])
+
+
+def _export(arguments: list[str]) -> int:
+    options = parse(ExportOptions, arguments, None, "labels export")
+    from senior import labels
+
+    count = labels.export_labels(options.run, options.out)
+    print(f"{count} pairs: {options.out} and {options.out.with_suffix('.npz')}")
+    return DONE
+
+
+def _import(arguments: list[str]) -> int:
+    options = parse(ImportOptions, arguments, None, "labels import")
+    from senior import labels
+
+    print(f"{labels.import_into(options.run, options.file)} pairs taken over into {options.run}")
+    return DONE
+
+
+def _stats(arguments: list[str]) -> int:
+    options = parse(StatsOptions, arguments, None, "labels stats")
+    check_installed()
+    from senior import labels
+
+    found = labels.stats(options.run)
+    print(json.dumps(found, indent=2) if options.json else labels.describe(found))
+    return DONE
+
+
 def _tasks(arguments: list[str]) -> int:
     parse(NoOptions, arguments, None, "tasks")
     from senior import envs
@@ -352,6 +420,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "resume": _resume,
     "eval": _eval,
     "label": _label,
+    "labels": _labels,
     "tasks": _tasks,
     "methods": _methods,
     "bench": _bench,
@@ -361,6 +430,7 @@ _SUMMARIES = {
     "resume": "continue an interrupted run, or all runs under a directory",
     "eval": "judge a run's policy on fresh episodes, and film it",
     "label": "serve the page on which people compare a run's clips",
+    "labels": "export, import, or look at what people said",
     "tasks": "list the tasks",
     "methods": "list the methods, cell by cell",
     "bench": "measure steps per second and where the time goes",

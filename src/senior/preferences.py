@@ -354,6 +354,12 @@ class Preferences:
                 [[answer[name] for name in ("pair", *ANSWER)] for answer in answers],
             )
 
+    def foretell(self, ids: Sequence[int], second: np.ndarray) -> None:
+        """Record what the model predicts ``[n]`` of pairs that were chosen without it: P(second preferred)."""
+        with transaction(self._db):
+            rows = [(float(value), number) for value, number in zip(second, ids, strict=True)]
+            self._db.executemany("UPDATE pairs SET prediction = ? WHERE id = ?", rows)
+
     def session(self, number: int) -> list[int]:
         """Numbers of the pairs chosen for a session, reserves included; none if it was not held yet."""
         return [row[0] for row in self._db.execute("SELECT id FROM pairs WHERE session = ? ORDER BY id", (number,))]

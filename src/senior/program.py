@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 
-from senior import parts, rundir
+from senior import labels, parts, rundir
 from senior.checks import check
 from senior.config import Config, load
 from senior.label.serving import Address, check_installed
@@ -99,6 +99,8 @@ def train_all(
         trainees = []
         for config, path in runs:
             own = replace(config, device=device, answering=parts.answering(config))
+            if parts.is_recorded(own):  # the run may go on from another folder
+                own = replace(own, teacher=str(Path(own.teacher).resolve()))
             spec = spec_of(own)
             _check_fit(own, spec)
             learner = make_learner(own, spec)
@@ -129,6 +131,13 @@ def _check_fit(config: Config, spec: EnvSpec) -> None:
             f"A segment of {config.queries.segment} steps does not fit into an episode of {spec.horizon}; "
             "lower --segment."
         )
+    if parts.is_recorded(config):
+        held = labels.pairs_in(Path(config.teacher), (config.queries.segment, spec.observation_size, spec.action_size))
+        if held < config.queries.budget:
+            raise BadInput(
+                f"{config.teacher} holds {held} answered pairs, fewer than the budget of {config.queries.budget}; give "
+                f"--budget {held} or less."
+            )
     if config.capacity < min(spec.horizon, config.steps):
         raise BadInput(
             f"A replay of {config.capacity} rows cannot hold an episode of {spec.horizon} steps; raise "

@@ -25,7 +25,12 @@ Warn = Callable[[str, str | None], None]
 def ask(trainee: Trainee, runs: Runs, i: int, step: int, n: int, warn: Warn) -> bool:
     """Put ``n`` pairs of run ``i`` of ``runs`` into its preference file; False: put off, there are no episodes yet."""
     progress, preferences = trainee.progress, trainee.preferences
-    if not preferences.session(progress.sessions):
+    held = preferences.session(progress.sessions)
+    if held and parts.is_recorded(trainee.config):
+        put = preferences.query(held, trainee.reward_per_step()).pairs
+        summed = runs.one(i, trainee.learner.summed_rewards, put.observation, put.action)
+        preferences.foretell(held, probability_second(np.asarray(summed).mean(axis=0)))
+    if not held:
         chosen = _choose(trainee, runs, i, step, n, warn)
         if chosen is None:
             return False

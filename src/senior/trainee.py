@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from senior import checkpoint, envs, parts
+from senior import checkpoint, envs, labels, parts
 from senior.config import Config, made_by
 from senior.envs.episodes import EVALUATION, TRAINING, Episodes, Failure, Local, Step, episode_seed, restore
 from senior.envs.recording import Recording, repeats_itself
@@ -136,6 +136,8 @@ class Trainee:
         """A new run in a directory made for it, whose environment stands at its first step (`reset`)."""
         self.directory.forget_everything()
         self._open_preferences()
+        if parts.is_recorded(self.config) and not self.preferences.session(0):
+            labels.import_labels(Path(self.config.teacher), self.preferences, self.config.queries.per_session)
         return self.learner.init(self.config)
 
     def stand(self, progress: dict[str, Any] | None) -> None:
@@ -182,8 +184,8 @@ class Trainee:
     def _relive(self, run: Run) -> None:
         """Bring the environment to where the run stands, by the running episode's seed and actions.
 
-        An environment that is filmed goes on with another episode instead. Any other that does not repeat itself is found out on the way. Where no episode is running, the latest
-        one is lived through again for that.
+        One that is filmed goes on with another episode instead. Any other that does not repeat itself is found out on
+        the way. Where no episode is running, the latest one is lived through again for that.
         """
         progress, count = self.progress, int(run.replay.count)
         if self.filmed:  # it cannot be lived through again: the episode that was running is broken off

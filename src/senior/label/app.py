@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -68,8 +68,8 @@ class Goal(_Sent):
     goal: Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=300)]
 
 
-def application(run: Standing, access: Access, clips: bool = True) -> FastAPI:
-    """The server of one run; ``clips``: have them drawn."""
+def application(run: Standing, access: Access, clips: bool = True, over: Callable[[], bool] = lambda: False) -> FastAPI:
+    """The server of one run; ``clips``: have them drawn. ``over``: whether it is to end, which waits for nobody."""
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -172,7 +172,7 @@ def application(run: Standing, access: Access, clips: bool = True) -> FastAPI:
     @app.get("/api/events", response_class=StreamingResponse, responses=_told(422))
     async def events(annotator: Annotated[Name | None, Query()] = None) -> StreamingResponse:
         """The state whenever it changes, as server-sent events."""
-        return StreamingResponse(_events(run, annotator), media_type="text/event-stream")
+        return StreamingResponse(_events(run, annotator, over), media_type="text/event-stream")
 
     @app.get("/api/overview")
     def overview() -> dict[str, Any]:
@@ -188,9 +188,9 @@ def _told(*codes: int) -> dict[int | str, dict[str, Any]]:
     return {code: {"description": "Refused, with the reason in a sentence."} for code in codes}
 
 
-async def _events(run: Standing, annotator: str | None) -> AsyncIterator[str]:
+async def _events(run: Standing, annotator: str | None, over: Callable[[], bool]) -> AsyncIterator[str]:
     told, quiet = "", 0.0
-    while True:
+    while not over():
         now = json.dumps(await run_in_threadpool(run.state, annotator))
         if now != told:
             told, quiet = now, 0.0

@@ -60,8 +60,8 @@ class Wanted(NamedTuple):
 class Store:
     """The clips of a run, as rows of its preference file and files in a folder."""
 
-    def __init__(self, run: Path) -> None:
-        """Waits until the trainer has made the preference file. Raises `BadInput` if it cannot be read."""
+    def __init__(self, run: Path, overlap: int = 1) -> None:
+        """``overlap``: how many people see each pair. Waits until the trainer has made the preference file. Raises `BadInput` if it cannot be read."""
         path = run / "preferences.sqlite"
         while not (path.exists() and path.stat().st_size):
             time.sleep(PAUSE)
@@ -70,6 +70,7 @@ class Store:
         self.db = connect(path)
         while not self.db.execute("PRAGMA user_version").fetchone()[0]:
             time.sleep(PAUSE)
+        self.overlap = overlap
         self._seen = -1
 
     def tidy(self) -> None:
@@ -102,6 +103,7 @@ class Store:
                 SELECT id AS pair, side, reserve,
                        iif(side, episode_1, episode_0) AS episode, iif(side, start_1, start_0) AS start
                 FROM pairs JOIN (SELECT 0 AS side UNION SELECT 1) WHERE collected_step IS NULL
+                AND (SELECT COUNT(*) FROM answers WHERE answers.pair = pairs.id AND withdrawn IS NULL) < ?
             ), chosen AS (
                 SELECT * FROM segments
                 WHERE NOT EXISTS (SELECT * FROM clips WHERE clips.pair = segments.pair AND clips.side = segments.side)
@@ -111,7 +113,7 @@ class Store:
                    shape.steps, shape.observation, shape.action
             FROM chosen JOIN pairs ON pairs.id = pair JOIN shape LEFT JOIN episodes ON episodes.episode = chosen.episode
             """,
-            (standing, step),
+            (self.overlap, standing, step),
         ).fetchone()
         if row is None:
             return None
@@ -191,12 +193,13 @@ def why_not(error: Exception, segment: Segment) -> str:
 
 def serve(run: Path) -> None:
     """Draw what is asked for, for ever. Raises `BadInput` where ``run`` is no run directory."""
-    stage = Stage(made_by(load(run / "config.json")))
+    config = load(run / "config.json")
+    stage = Stage(made_by(config))
     folder = run / "label" / "clips"
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with _alone(folder):
-            store = Store(run)
+            store = Store(run, config.asking.overlap)
             store.tidy()
             while True:
                 store.wait()

@@ -112,15 +112,17 @@ def serve(run: Path, address: Address, owner: str) -> Served:
     served = Served(_shown_host(address.host), port, token, os.getpid(), owner)
     served.write(run)
     print(served.url, flush=True)
+    access = access_to(address, port, token)
     serving = uvicorn.Config(
-        application(standing_of(run, config), access_to(address, port, token)),
+        application(standing_of(run, config), access, over=lambda: server.should_exit),
         log_level="warning",
         access_log=False,
         server_header=False,
-        timeout_graceful_shutdown=1,
+        timeout_graceful_shutdown=2,
         h11_max_incomplete_event_size=MOST_BYTES,
     )
-    uvicorn.Server(serving).run(sockets=[listening])
+    server = uvicorn.Server(serving)
+    server.run(sockets=[listening])
     os.close(lock)
     return served
 
