@@ -124,7 +124,9 @@ class Person:
         return left, right
 
     def leave(self, expected: str | None = None) -> None:
-        """Close the page. Nothing of it sticks out sideways, and nothing was complained of but what was ``expected``."""
+        """Close the page, once. Nothing sticks out sideways, and nothing was complained of but what was ``expected``."""
+        if not self.context.pages:
+            return
         wide = self.page.evaluate("document.documentElement.scrollWidth - innerWidth")
         self.context.close()
         assert wide <= 0, f"{wide} pixels of the page stick out"

@@ -78,14 +78,15 @@ def test_what_needs_an_extra_is_imported_by_functions_only():
     """Without ``label`` installed everything else works, and asking for it says what to install."""
     script = """
 import importlib.util, sys
+missing = ("fastapi", "starlette", "uvicorn", "jinja2", "pydantic", "statsmodels")
 class Missing:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ("fastapi", "starlette", "uvicorn", "jinja2", "pydantic", "statsmodels"):
+        if name.partition(".")[0] in missing:
             raise ModuleNotFoundError(name)
 sys.meta_path.insert(0, Missing())
 import senior.program, senior.cli, senior.labels, senior.label.clips
 find = importlib.util.find_spec
-importlib.util.find_spec = lambda name: None if name == "fastapi" else find(name)
+importlib.util.find_spec = lambda name: None if name in missing else find(name)
 code = senior.cli.main(["train", "--task", "point", "--method", "pebble", "--teacher", "human", "--out", sys.argv[1]])
 assert code == 2, code
 """

@@ -131,7 +131,15 @@ def test_everything_but_health_needs_the_token(run: StandIn, server: Server, cli
 
 
 def test_no_address_lets_one_in_without_the_token(server: Server, stranger: Client):
-    for path in "/nothing /health/ //health /api/state;/health /health/../api/state /he%0aalth /%68ealth/x".split():
+    for path in [
+        "/nothing",
+        "/health/",
+        "//health",
+        "/api/state;/health",
+        "/health/../api/state",
+        "/he%0aalth",
+        "/%68ealth/x",
+    ]:
         assert stranger.get(path).status == 401
     for host in ("/health?", "/health#", "\\health?", "@/health"):
         assert stranger.get("/api/state", host=f"{stranger.netloc}{host}").status in (401, 403)
@@ -158,12 +166,28 @@ def test_only_pages_take_the_token_from_the_address(server: Server, stranger: Cl
     assert_refused(stranger.post(f"/?token={token_of(server)}", {}), 401)
 
 
-FOREIGN_HOSTS = " evil.example evil.example:{port} 127.0.0.1.evil.example [::1 127.0.0.2 x@evil.example".split(" ")
-OWN_HOSTS = "127.0.0.1:{port} localhost:{port} LOCALHOST [::1]:{port}".split()
-FOREIGN_ORIGINS = (
-    " null http://evil.example http://localhost:1 http://127.0.0.1 http://127.0.0.1:{port}.evil.example http://["
-    " ftp://127.0.0.1:{port} //127.0.0.1:{port} http://x@127.0.0.1:{port}"
-).split(" ")
+FOREIGN_HOSTS = [
+    "",
+    "evil.example",
+    "evil.example:{port}",
+    "127.0.0.1.evil.example",
+    "[::1",
+    "127.0.0.2",
+    "x@evil.example",
+]
+OWN_HOSTS = ["127.0.0.1:{port}", "localhost:{port}", "LOCALHOST", "[::1]:{port}"]
+FOREIGN_ORIGINS = [
+    "",
+    "null",
+    "http://evil.example",
+    "http://localhost:1",
+    "http://127.0.0.1",
+    "http://127.0.0.1:{port}.evil.example",
+    "http://[",
+    "ftp://127.0.0.1:{port}",
+    "//127.0.0.1:{port}",
+    "http://x@127.0.0.1:{port}",
+]
 
 
 def with_port(text: str, client: Client) -> str:
@@ -319,14 +343,49 @@ def test_script_in_what_people_write_comes_back_as_text(client: Client):
 # Files.
 
 
-UP = (
-    "../ ..%2f %2e%2e/ %2e%2e%2f ..\\ ..%5c %252e%252e%252f ....// / %2f .%00./ ..;/ %c0%ae%c0%ae/ ../clips/../"
-).split()
-FILES = (
-    "token token.mp4 server.json config.json label/token label/server.json%00.mp4 etc/passwd app.py label.html "
-    "page/label.html"
-).split()
-NAMES = " . .. %00 .mp4 a.mp4 *.mp4 label.html page.js%00 page.js/ PAGE.JS ~root con".split(" ")
+UP = [
+    "../",
+    "..%2f",
+    "%2e%2e/",
+    "%2e%2e%2f",
+    "..\\",
+    "..%5c",
+    "%252e%252e%252f",
+    "....//",
+    "/",
+    "%2f",
+    ".%00./",
+    "..;/",
+    "%c0%ae%c0%ae/",
+    "../clips/../",
+]
+FILES = [
+    "token",
+    "token.mp4",
+    "server.json",
+    "config.json",
+    "label/token",
+    "label/server.json%00.mp4",
+    "etc/passwd",
+    "app.py",
+    "label.html",
+    "page/label.html",
+]
+NAMES = [
+    "",
+    ".",
+    "..",
+    "%00",
+    ".mp4",
+    "a.mp4",
+    "*.mp4",
+    "label.html",
+    "page.js%00",
+    "page.js/",
+    "PAGE.JS",
+    "~root",
+    "con",
+]
 
 
 @pytest.mark.parametrize("root", ["/clips/", "/static/"])

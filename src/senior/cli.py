@@ -47,8 +47,8 @@ class PageOptions:
     """Address to listen on. 0.0.0.0 lets other machines in; who opens the page needs the token in its address."""
     port: int | Literal["auto"] = "auto"
     """auto: where the run was served before, else the first free one from 8642 on."""
-    allowed_host: tuple[str, ...] = ()
-    """Further names that browsers may know this machine by."""
+    allowed_host: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A further name that browsers may know this machine by; may be given several times."""
     token: str | None = None
     """Token of the page's address; left out: the run's own. Empty: everybody on this machine may."""
 

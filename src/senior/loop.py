@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
-from senior import health, parts, session
+from senior import health, session
 from senior.envs.episodes import Episodes, Failure, Step
 from senior.evaluate import judge, summary
 from senior.learner import Purpose, act, acting, actor_of, mean_action
@@ -204,10 +204,13 @@ class Training:
         if plan.begin and trainee.spec.length_scale is None and not progress.measured:
             self.runs.one(i, learner.measure)
             progress.measured = True
+        warn = partial(self.warn, i)
         if heard:
-            session.learn(trainee, self.runs, i, step, partial(self.warn, i))
+            session.learn(trainee, self.runs, i, step, warn)
         elif plan.session and not trainee.waits:
-            self.session(i, step, plan.session)
+            refused = session.hold(trainee, self.runs, i, step, plan.session, warn, partial(self.pause, i, step))
+            if refused:
+                self.fail(i, step, refused)
             if not trainee.goes_on:
                 return
         if plan.outer and progress.labels:
@@ -221,31 +224,16 @@ class Training:
             self.runs.one(i, learner.begin, at)
             progress.updates += trainee.config.sac.reset_updates
 
-    def session(self, i: int, step: int, n: int) -> None:
-        """Ask ``n`` pairs, and learn from the answers if they are there or must be waited for."""
+    def pause(self, i: int, step: int, first: bool) -> bool:
+        """Wait a moment for answers, telling so at the ``first`` time; False: to be left off, as after an interrupt."""
+        if self.watcher.stop:
+            return False
         trainee = self.trainees[i]
-        warn = partial(self.warn, i)
-        if parts.takes_time(trainee.config) and step > trainee.progress.step:
-            trainee.save(self.runs[i], step)  # whatever befalls it while it waits
-        if not session.ask(trainee, self.runs, i, step, n, warn):
-            return
-        refused, told = session.listen(trainee), False
-        while not refused and not trainee.answered(step):
-            if not (trainee.config.asking.wait or trainee.progress.collected == 0):
-                return
-            if self.watcher.stop:
-                trainee.done = True  # saved above, as it was before it asked
-                return
-            if not told:
-                self.watcher.say(f"{trainee.name} waits for the answers to {n} pairs at step {step:,}.")
-                told = True
-            trainee.tell("waiting", step)
-            time.sleep(LISTEN_SECONDS)
-            refused = session.listen(trainee)
-        if refused:
-            self.fail(i, step, refused)
-        else:
-            session.learn(trainee, self.runs, i, step, warn)
+        if first:
+            self.watcher.say(f"{trainee.name} waits for answers at step {step:,}.")
+        trainee.tell("waiting", step)
+        time.sleep(LISTEN_SECONDS)
+        return True
 
     def heard(self, i: int, step: int) -> bool:
         """Whether a session that is not waited for has been answered by ``step``."""

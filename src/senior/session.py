@@ -1,7 +1,7 @@
 """A session of Algorithm 1: choose pairs of segments, ask about them, fit the reward model to the answers.
 
-Host code. `ask` puts the pairs, `listen` takes down what the teacher has said since, `learn` fits once all is
-answered: at once where a teacher answers at once, else later. A session that is in the preference file already, because
+Host code. `hold` is a session that is waited for, in three parts: `ask` puts the pairs, `listen` takes down what the
+teacher has said since, `learn` fits once all is answered. A session that is in the preference file already, because
 a run that went on after it was killed comes to it again, is not chosen anew: what was said of it still holds.
 """
 
@@ -20,6 +20,31 @@ from senior.types import Pairs, Preferred, Query
 
 Warn = Callable[[str, str | None], None]
 """Tells a warning of a kind, if there is one."""
+
+
+def hold(
+    trainee: Trainee, runs: Runs, i: int, step: int, n: int, warn: Warn, pause: Callable[[bool], bool]
+) -> str | None:
+    """Ask ``n`` pairs in run ``i`` of ``runs``, and learn from the answers if they come at once or are waited for.
+
+    pause: waits a moment, told whether it is the first; False: the run is to be left as it was saved before it asked.
+    Returns None, or in a sentence why the run cannot go on.
+    """
+    if parts.takes_time(trainee.config) and step > trainee.progress.step:
+        trainee.save(runs[i], step)  # whatever befalls it while it waits
+    if not ask(trainee, runs, i, step, n, warn):
+        return None
+    refused, first = listen(trainee), True
+    while not refused and not trainee.answered(step):
+        if not (trainee.config.asking.wait or trainee.progress.collected == 0):
+            return None
+        if not pause(first):
+            trainee.done = True
+            return None
+        refused, first = listen(trainee), False
+    if not refused:
+        learn(trainee, runs, i, step, warn)
+    return refused
 
 
 def ask(trainee: Trainee, runs: Runs, i: int, step: int, n: int, warn: Warn) -> bool:

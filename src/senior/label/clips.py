@@ -61,7 +61,10 @@ class Store:
     """The clips of a run, as rows of its preference file and files in a folder."""
 
     def __init__(self, run: Path, overlap: int = 1) -> None:
-        """``overlap``: how many people see each pair. Waits until the trainer has made the preference file. Raises `BadInput` if it cannot be read."""
+        """``overlap``: how many people see each pair. Waits until the trainer has made the preference file.
+
+        Raises `BadInput` if it cannot be read.
+        """
         path = run / "preferences.sqlite"
         while not (path.exists() and path.stat().st_size):
             time.sleep(PAUSE)

@@ -11,7 +11,7 @@ from typing import Any
 
 from senior.config import Config
 from senior.envs.metaworld import TASKS
-from senior.label.desk import Desk
+from senior.label.desk import Assignment, Desk
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,12 @@ class Standing:
 
     def turn(self, annotator: str, said: dict[str, Any] | None = None) -> dict[str, Any]:
         """The pair that somebody is to look at, or why there is none."""
-        assignment, state = self.desk.assign(annotator), self.state(annotator)
-        kind, why = assignment.kind, None
+        state = self.state(annotator)
+        phase, why = state["trainer"]["phase"], None
+        # a session that nobody waited for may be left when training ends; its answers would teach nobody
+        assignment = Assignment(None, [], "finished") if phase == "finished" else self.desk.assign(annotator)
+        kind = assignment.kind
         if kind is not None:
-            phase = state["trainer"]["phase"]
             kind = phase if kind == "waiting" and phase in ("finished", "stopped") else kind
             why = {
                 "drawing": "The next clips are being drawn.",
