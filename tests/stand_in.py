@@ -4,12 +4,12 @@ real server of it, in a process of its own; and a client that keeps its cookie. 
 
 from __future__ import annotations
 
+import fcntl
 import http.client
 import json
 import os
 import secrets
 import select
-import signal
 import socket
 import subprocess
 import sys
@@ -47,15 +47,17 @@ def configured(asking: Asking = PAPER) -> Config:
 class StandIn:
     """A run directory, and the trainer's half of its preference file."""
 
-    def __init__(self, path: Path, asking: Asking = PAPER) -> None:
+    def __init__(self, path: Path, asking: Asking = PAPER, capacity: int = CAPACITY) -> None:
         self.path = path
         self.config = configured(asking)
         self.rules = Rules(asking.overlap, asking.replace_skipped, asking.soft_labels)
         self.clips = path / "label" / "clips"
         self.clips.mkdir(parents=True)
         (path / "config.json").write_text(json.dumps({"config": to_json(self.config), "protocol": {}}))
-        self.preferences = Preferences(self.file, CAPACITY, H, O, A)
+        self.preferences = Preferences(self.file, capacity, H, O, A)
         self._other = connect(self.file)
+        self._lock = os.open(self.clips, os.O_RDONLY)
+        fcntl.flock(self._lock, fcntl.LOCK_EX)  # the clip process waits for it, so that only `draw` draws
         self.sessions = 0
         """How many were asked."""
         self.collected = 0
@@ -71,7 +73,8 @@ class StandIn:
         self.close()
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file, and let others draw."""
+        os.close(self._lock)
         self._other.close()
         self.preferences.close()
 
@@ -231,31 +234,34 @@ class Server:
         self.process = subprocess.Popen(
             command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
-        self._said: list[str] = []
-        assert self.process.stderr
-        self._hearing = threading.Thread(target=self._said.extend, args=(self.process.stderr,), daemon=True)
-        self._hearing.start()
         assert self.process.stdout
+        self._said: list[str] = []
+        self._hearing = threading.Thread(target=self._hear, daemon=True)
+        self._hearing.start()
         self.url = self.process.stdout.readline().strip()
         """Empty if it ended at once."""
 
-    @property
-    def complaints(self) -> str:
-        return "".join(self._said)
+    def _hear(self) -> None:
+        assert self.process.stderr
+        with self.process.stderr as said:
+            self._said.extend(said)
 
     def kill(self) -> None:
         """End it as nobody should, and wait until it has."""
-        self.process.send_signal(signal.SIGKILL)
-        self.close()
+        self.process.kill()
+        self._wait()
 
-    def close(self) -> None:
-        """End it and wait; its clip process then ends by itself."""
+    def close(self) -> str:
+        """End it, wait until its clip process has ended too, and return what they complained of."""
         self.process.terminate()
-        self.process.wait(20)
+        self._wait()
         self._hearing.join(20)
-        for stream in (self.process.stdout, self.process.stderr):
-            assert stream
-            stream.close()
+        return "".join(self._said)
+
+    def _wait(self) -> None:
+        assert self.process.stdout
+        self.process.wait(20)
+        self.process.stdout.close()
 
 
 @contextmanager
@@ -265,8 +271,8 @@ def serving(run: Path, address: Address = LOCAL) -> Iterator[Server]:
     try:
         yield server
     finally:
-        server.close()
-    assert "Traceback" not in server.complaints, server.complaints
+        complaints = server.close()
+    assert "Traceback" not in complaints, complaints
 
 
 def raw(url: str, requests: Sequence[bytes], patience: float = 1.0) -> list[bytes]:

@@ -49,7 +49,7 @@ KEYS = [  # all that answer
 ]
 GONE = "net::ERR_"
 """What the browser complains of where no server answers, in the middle of its sentence."""
-REFUSED = "the server responded with a status of"
+REFUSED = "the server responded with a status of 409"
 
 
 def steered(episode: int, rng: np.random.Generator, steps: int) -> np.ndarray:
@@ -194,7 +194,7 @@ def red_point(person: Person, side: str) -> np.ndarray:
 
 def test_undo_and_redo_in_any_order(browser: Browser, run: Lived):
     """Page, file and trainer agree after every key."""
-    ids = run.ask(6)
+    ids = run.ask(3)
     rng = random.Random(0)
     standing: list[tuple[int, str, str | None]] = []
     undone: list[tuple[int, str, str | None]] = []
@@ -202,7 +202,8 @@ def test_undo_and_redo_in_any_order(browser: Browser, run: Lived):
     seen = set()
     with visited(browser, run) as enter:
         ann = enter()
-        for _ in range(40):
+        ann.ready()
+        for _ in range(50):
             ann.wait(SETTLED)
             pair = ann.pair
             kind = rng.choices(["answer", "undo", "redo"], [4, 3, 2])[0]
@@ -223,10 +224,13 @@ def test_undo_and_redo_in_any_order(browser: Browser, run: Lived):
                     assert said == "There is nothing to redo." and ann.pair == pair
             elif pair:
                 key, answer, strength = rng.choice(KEYS)
-                assert ann.press(key) == f"Saved: {saved(answer, strength)}"
+                said = ann.press(key)
+                assert said == f"Saved: {saved(answer, strength)}"
                 standing.append((pair, answer, strength))
                 undone.clear()
-            seen.add((kind, bool(standing), bool(undone), pair is None))
+            else:
+                continue
+            seen.add((said.split()[0], pair is None))
             assert ann.text("labels") == f"{len(standing)} of {BUDGET} labels"
             assert [(row.pair, row.answer, row.strength) for row in sorted(run.answers())] == sorted(
                 (pair, meant(answer, left[pair]), strength) for pair, answer, strength in standing
@@ -238,7 +242,10 @@ def test_undo_and_redo_in_any_order(browser: Browser, run: Lived):
             ]
             for selector in spent:
                 ann.wait(selector)
-        assert len(seen) > 8, "or there was little to see"
+        assert seen == {(word, last) for word in ("Undone:", "There") for last in (True, False)} | {
+            ("Saved:", False),
+            ("Redone:", False),
+        }
         while (pair := ann.pair) is not None:
             ann.ready()
             ann.press("ArrowLeft")
@@ -246,6 +253,7 @@ def test_undo_and_redo_in_any_order(browser: Browser, run: Lived):
         run.collect()
         assert ann.press("z") == "Your last answer has been trained on already, so it cannot be undone."
         assert ann.text("labels") == f"{len(ids)} of {BUDGET} labels"
+        ann.forgive(REFUSED)
     targets = {0: 0.0, 1: 1.0, -1: 0.5, None: None}
     assert dict(run.sql("SELECT id, second FROM pairs")) == {
         pair: targets[meant(answer, left[pair])] for pair, answer, _ in standing
@@ -291,15 +299,14 @@ def test_keys_do_nothing_where_they_are_not_meant(browser: Browser, run: Lived):
         ann.ready()
         ann.press("ArrowLeft")
         ann.ready(but=ids[0])
-        ann.context.route("**/clips/*", held.append)
+        ann.context.route("**/clips/*", lambda route: held.append(route))
         ann.page.reload()
         ann.wait("body[data-state=loading]")
         assert ann.press("ArrowLeft") == "The clips are still loading."
         assert ann.attribute("#left", "aria-disabled") == "true"
         assert ann.press("s") == "Saved: cannot tell"
         ann.context.unroute("**/clips/*")
-        for route in held:
-            route.abort()  # of clips that nobody wants any more, but for the next pair's: it is asked for again
+        ann.page.reload()
         assert ann.ready() == ids[2]
         ann.page.click("#goal-edit")
         ann.page.keyboard.type("as de=z, .[]1")
@@ -315,7 +322,6 @@ def test_keys_do_nothing_where_they_are_not_meant(browser: Browser, run: Lived):
             ann.page.keyboard.press(key)
         ann.page.wait_for_timeout(200)
         assert ann.ready() == ids[2]
-        ann.complaints = [said for said in ann.complaints if GONE not in said]
     assert [(row.pair, row.answer) for row in run.answers()] == [(ids[0], 0), (ids[1], None)]
 
 
@@ -397,7 +403,7 @@ def test_a_pair_that_is_not_answered_goes_to_somebody_else_after_its_lease(brows
         said = ann.press("ArrowLeft")
         assert said == f"Pair {first} has been answered by somebody else meanwhile."
         ann.wait("body[data-state=empty]")
-        ann.complaints = [said for said in ann.complaints if f"{REFUSED} 409" not in said]
+        ann.forgive(REFUSED)
     assert [(row.pair, row.annotator) for row in run.answers()] == [(second, "bob"), (first, "bob")]
 
 
@@ -446,7 +452,8 @@ def test_a_killed_server_loses_nothing_and_doubles_nothing(browser: Browser, run
         ann.page.keyboard.press("ArrowLeft")
         ann.wait("body[data-state=expired]")
         ann.wait_for_text("unsaved", "This link has expired.")
-        ann.leave(expected="Failed to load resource")
+        ann.forgive("Failed to load resource")
+        ann.leave()
 
 
 def ann_port(server: Server) -> int:
@@ -476,7 +483,7 @@ def test_an_answer_whose_acknowledgement_is_lost_is_saved_once(browser: Browser,
         assert len(run.answers()) == 1
         assert len(run.sql("SELECT * FROM posts")) == 1
         assert len(ann.complaints) == 2
-        ann.complaints.clear()
+        ann.forgive("Failed to load resource")
 
 
 def test_what_is_going_on_where_there_is_nothing_to_answer(browser: Browser, run: Lived):
@@ -593,7 +600,7 @@ LAYOUTS: dict[str, dict[str, Any]] = {
 
 
 def test_everything_fits_light_or_dark_desk_or_phone(browser: Browser, run: Lived, tmp_path: Path):
-    run.ask(len(LAYOUTS), left=[0] * len(LAYOUTS))
+    run.ask(2 * len(LAYOUTS))  # each also leases a pair that is not answered
     with visited(browser, run) as enter:
         for name, layout in LAYOUTS.items():
             person = enter(name, **layout)
@@ -603,7 +610,8 @@ def test_everything_fits_light_or_dark_desk_or_phone(browser: Browser, run: Live
                 box = person.page.locator(f"#{id}").bounding_box()
                 assert box, id
                 assert box["x"] >= 0 and box["x"] + box["width"] <= width, (name, id, box)
-                assert box["y"] >= 0 and box["y"] + box["height"] <= height, (name, id, box)
+                if name != "small phone":  # on which one scrolls
+                    assert box["y"] >= 0 and box["y"] + box["height"] <= height, (name, id, box)
                 assert box["height"] >= (44 if layout.get("has_touch") else 36), (name, id, box)
             panes = [person.page.locator(f"#pane-{side}").bounding_box() for side in ("left", "right")]
             assert all(box and min(box["width"], box["height"]) >= 130 for box in panes), (name, panes)
@@ -643,7 +651,8 @@ def test_a_person_at_the_page_trains_the_policy_that_the_oracle_trains(browser: 
     teach(ann, run, 25)
     ann.wait_for_text("empty-title", "All labels are given. Thank you.")
     trainer.wait()
-    ann.leave(expected=GONE)
+    ann.forgive(GONE)
+    ann.leave()
     assert_same_learning(run, oracle)
 
 
@@ -662,7 +671,8 @@ def test_a_trainer_that_is_killed_amid_a_session_goes_on_and_so_does_the_page(
     teach(ann, run, 9)
     ann.wait_for_text("empty-title", "All labels are given. Thank you.")
     trainer.wait()
-    ann.leave(expected=GONE)
+    ann.forgive(GONE)
+    ann.leave()
     ((count,),) = sql(run, "SELECT COUNT(*) FROM answers")
     assert count == 25
     assert_same_learning(run, oracle)

@@ -35,7 +35,8 @@ from tests.siege import follow_description, kill_while_posting, throw_bytes
 from tests.stand_in import LOCAL, STUB, Client, Reply, Server, StandIn, new_id, raw, serving
 
 KILLS = 20
-REQUESTS = 1000
+BYTES, DESCRIBED = 750, 250
+"""Requests."""
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; media-src 'self'; "
     "connect-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -469,20 +470,17 @@ def test_many_ranges_cost_no_more_than_the_clip(client: Client, clip: str, count
 
 
 def test_more_than_a_page_sends_is_not_taken(run: StandIn, client: Client, server: Server):
-    before = run.contents()
-    body = json.dumps({"goal": MOST_BYTES * "x"}).encode()
-    assert_refused(client.send("POST", "/api/goal", body, content_type="application/json"), 413, f"{MOST_BYTES} bytes")
-    pieces = (body[i : i + 1000] for i in range(0, len(body), 1000))
-    with Client(server.url) as other:
-        assert_refused(other.send("POST", "/api/goal", pieces, content_type="application/json"), 413)
-    endless = f"POST /api/goal HTTP/1.1\r\nHost: {client.netloc}\r\nCookie: {client.cookie}\r\n"
-    lying = endless + f"Content-Length: {10**15}\r\n\r\n" + 2 * MOST_BYTES * "x"
-    (heard,) = raw(server.url, [lying.encode()], 10)
-    assert heard.startswith(b"HTTP/1.1 413 ")
+    def send(body: bytes) -> Reply:
+        return client.send("POST", "/api/goal", body, content_type="application/json")
+
+    before, goal = run.contents(), b'{"goal": "Open it"}'
+    head = f"POST /api/goal HTTP/1.1\r\nHost: {client.netloc}\r\nCookie: {client.cookie}\r\n"
+    lying = f"{head}Content-Length: {10**15}\r\n\r\n".encode() + 2 * MOST_BYTES * b"x"
+    chunked = f"{head}Transfer-Encoding: chunked\r\n\r\n".encode() + 20 * (b"3e8\r\n" + 1000 * b"x" + b"\r\n")
+    assert [heard[:13] for heard in raw(server.url, [lying, chunked])] == 2 * [b"HTTP/1.1 413 "]
     assert run.contents() == before
-    just = json.dumps({"goal": "x"}).encode()
-    assert client.send("POST", "/api/goal", just.ljust(MOST_BYTES), content_type="application/json").status == 200
-    assert_refused(client.send("POST", "/api/goal", just.ljust(MOST_BYTES + 1), content_type="application/json"), 413)
+    assert send(goal.ljust(MOST_BYTES)).status == 200
+    assert_refused(send(goal.ljust(MOST_BYTES + 1)), 413, f"{MOST_BYTES} bytes")
 
 
 def test_what_comes_in_pieces_is_taken_whole(client: Client):
@@ -525,7 +523,8 @@ NO_ANSWERS: list[dict[str, Any]] = [
 @pytest.mark.parametrize("body", NO_GOALS, ids=lambda body: ascii(body[:20]))
 def test_what_is_no_goal_is_refused(run: StandIn, client: Client, body: bytes):
     before = run.contents()
-    assert_refused(client.send("POST", "/api/goal", body, content_type="application/json"), 422)
+    reply = client.send("POST", "/api/goal", body, content_type="application/json")
+    assert_refused(reply, 400 if body == b"\xff" else 422)
     assert run.contents() == before
 
 
@@ -650,6 +649,16 @@ def test_what_the_trainer_does_is_told_whatever_it_has_written(tmp_path: Path, c
     assert ("No space" in told["text"]) == ("failure" in (content or ""))
 
 
+def test_an_answer_is_not_held_back(client: Client):
+    """By the two ends of the connection waiting for each other (Nagle, delayed acknowledgement): 40 ms, every time."""
+    times = []
+    for _ in range(20):
+        began = time.monotonic()
+        client.get("/health")
+        times.append(time.monotonic() - began)
+    assert min(times) < 0.035
+
+
 # One server for a run, and its token.
 
 
@@ -703,7 +712,6 @@ def test_what_cannot_be_served_is_told_in_a_sentence(fresh: StandIn, tmp_path: P
     for token in ("a b", "a;b", "ключ", "a&b", 'a"b', "a\nb"):
         assert "can stand in a token" in refused(fresh.path, Address(token=token))
     assert "Cannot listen on 192.0.2.1, port 8642: " in refused(fresh.path, Address(host="192.0.2.1"))
-    assert "no address" in refused(fresh.path, Address(host="a..b"))
     plain = replace(fresh.config, method=methods.method("sac"))
     (fresh.path / "config.json").write_text(json.dumps({"config": to_json(plain), "protocol": {}}))
     assert "true reward" in refused(fresh.path)
@@ -796,11 +804,10 @@ def test_many_people_at_once_are_never_given_the_same_pair_nor_locked_out(fresh:
     assert [(pair, who) for pair, who, _, _ in fresh.standing()] == [(pair, *given[pair]) for pair in sorted(given)]
     assert fresh.sql("SELECT COUNT(*) FROM answers") == [(pairs + sessions,)]
     assert len({name for names in given.values() for name in names}) > people / 2
-    assert "locked" not in server.complaints
 
 
 def test_no_bytes_make_it_fail(run: StandIn, server: Server, client: Client, clip: str):
-    found = throw_bytes(server, client, REQUESTS // 2, clip, range(1, 6), seed=0)
+    found = throw_bytes(server, client, BYTES, clip, range(1, 6), seed=0)
     assert all(found[status] for status in (200, 400, 401, 403, 404, 422)), found
     with Client(server.url) as again:
         assert again.get("/health").data == {"status": "ok"}
@@ -808,8 +815,8 @@ def test_no_bytes_make_it_fail(run: StandIn, server: Server, client: Client, cli
 
 
 def test_nothing_that_the_description_allows_or_forbids_makes_it_fail(run: StandIn, server: Server, client: Client):
-    found = follow_description(server, client, REQUESTS // 2, seed=0)
-    assert found.total() >= REQUESTS // 2
+    found = follow_description(server, client, DESCRIBED, seed=0)
+    assert found.total() >= DESCRIBED
     assert all(found[status] for status in (200, 404, 409, 422)), found
     with Client(server.url) as again:
         assert again.get("/health").data == {"status": "ok"}

@@ -69,15 +69,13 @@ def _bind(address: Address, before: int | None) -> socket.socket:
     family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
     ports = [address.port] if address.port else [*([before] if before else []), *range(FIRST_PORT, FIRST_PORT + 50), 0]
     for port in ports:
-        listening = socket.socket(family)
+        # the protocol is told: else asyncio leaves Nagle's algorithm on, which costs 40 ms for every answer
+        listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listening.bind((address.host, port))
             listening.listen(128)
             return listening
-        except UnicodeError as error:
-            listening.close()
-            raise BadInput(f"Cannot listen on {address.host}: that is no address.") from error
         except OSError as error:
             listening.close()
             if address.port or error.errno != errno.EADDRINUSE:
@@ -102,6 +100,15 @@ def serve(run: Path, address: Address, owner: str) -> Served:
     except BlockingIOError:
         os.close(lock)
         return Served.read(run)
+    try:
+        return _serve_alone(run, config, address, owner)
+    finally:
+        os.close(lock)
+
+
+def _serve_alone(run: Path, config: Config, address: Address, owner: str) -> Served:
+    """Serve a run whose lock is held."""
+    folder = run / "label"
     before = Served.find(run)
     (folder / "server.json").unlink(missing_ok=True)  # of a server that is gone
     token = _token(folder, address.token)
@@ -123,7 +130,6 @@ def serve(run: Path, address: Address, owner: str) -> Served:
     )
     server = uvicorn.Server(serving)
     server.run(sockets=[listening])
-    os.close(lock)
     return served
 
 
