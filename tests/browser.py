@@ -76,6 +76,7 @@ class Person:
         self.context.set_default_timeout(1000 * PATIENCE)
         self.page = self.context.new_page()
         self.complaints: list[str] = []
+        self._forgiven: list[str] = []
         self.page.on("console", lambda said: said.type in ("error", "warning") and self.complaints.append(said.text))
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
 
@@ -123,9 +124,9 @@ class Person:
         left, right = (Path(self.attribute(f"#video-{side}", "src") or "").stem for side in ("left", "right"))
         return left, right
 
-    def forgive(self, expected: str) -> None:
-        """Complaints that hold these words were expected."""
-        self.complaints = [said for said in self.complaints if expected not in said]
+    def forgive(self, words: str) -> None:
+        """Complaints that hold these words are no fault of the page."""
+        self._forgiven.append(words)
 
     def leave(self) -> None:
         """Close the page, if it is open. Nothing of it sticks out sideways, and nothing was complained of."""
@@ -133,7 +134,8 @@ class Person:
             wide = self.page.evaluate("document.documentElement.scrollWidth - innerWidth")
             self.context.close()
             assert wide <= 0, f"{wide} pixels of the page stick out"
-            assert not self.complaints, self.complaints
+            wrong = [said for said in self.complaints if not any(words in said for words in self._forgiven)]
+            assert not wrong, wrong
 
 
 class Row(NamedTuple):
@@ -168,6 +170,8 @@ class Lived:
         sizes = spec.observation_size, spec.action_size
         self.preferences = Preferences(self.file, config.queries.budget, config.queries.segment, *sizes)
         self.sessions = self.collected = self.episodes = 0
+        self.before = 0
+        """How many pairs there were when the present test began."""
 
     @property
     def file(self) -> Path:
@@ -179,7 +183,8 @@ class Lived:
         self.env.close()
 
     def ask(self, pairs: int, left: Sequence[int] | None = None, episodes: int = 2) -> list[int]:
-        """Ask another session of pairs, each of segments of two of ``episodes`` new episodes; returns their numbers.
+        """Ask another session of pairs, each of segments of two of ``episodes`` new episodes, not from their
+        beginnings; returns their numbers.
 
         left: which segment of each is shown there, else alternating. All are predicted to be better in the second.
         """
@@ -188,7 +193,10 @@ class Lived:
         lived = {number: self._live(number) for number in range(first, self.episodes)}
         rng = np.random.default_rng(self.sessions)
         cut = [
-            [(number, int(rng.integers(self._steps - segment))) for number in rng.permutation(list(lived))[:2]]
+            [
+                (int(number), int(rng.integers(self._steps // 3, self._steps - segment)))
+                for number in rng.permutation(list(lived))[:2]
+            ]
             for _ in range(pairs)
         ]
 
@@ -219,10 +227,29 @@ class Lived:
             rewards.append(float(reward))
         return np.array(observations), actions.astype(np.float32), np.array(rewards, np.float32)
 
+    def wait_drawn(self, patience: float = PATIENCE) -> None:
+        """Until the clips of all that is asked are there, or cannot be; so many seconds at most."""
+        until = time.monotonic() + patience
+        missing = (
+            "SELECT 2 * COUNT(*) - (SELECT COUNT(*) FROM clips JOIN pairs ON pairs.id = pair "
+            "WHERE collected_step IS NULL) FROM pairs WHERE collected_step IS NULL"
+        )
+        while self.sql(missing) != [(0,)]:
+            assert time.monotonic() < until
+            time.sleep(0.02)
+
     def collect(self) -> None:
         """Train on the earliest session that is not collected."""
         self.preferences.collect(self.collected, 1000 * (self.collected + 1) + 5, self.rules)
         self.collected += 1
+
+    def begin(self) -> None:
+        """Train on all that was asked, be it answered or not, so that nothing is left of it but its numbers."""
+        while self.collected < self.sessions:
+            self.collect()
+        ((self.before,),) = self.sql("SELECT COUNT(*) FROM pairs")
+        self.sql("DELETE FROM notes")
+        self.tell("waiting")
 
     def tell(self, phase: str, step: int = 1000, **more: object) -> None:
         """Write down what the trainer, which is this process, is doing."""
@@ -236,12 +263,13 @@ class Lived:
         return sql(self.path, statement, *values)
 
     def answers(self) -> list[Row]:
-        """Those that stand, in the order in which they were given first."""
+        """Those to the pairs of the present test that stand, in the order in which they were given first."""
         return [
             Row(*row[:7], clips=row[7:])
             for row in self.sql(
                 "SELECT pair, annotator, answer, strength, seconds, replays, shown_left, clip_0, clip_1 FROM answers "
-                "WHERE withdrawn IS NULL ORDER BY id"
+                "WHERE withdrawn IS NULL AND pair > ? ORDER BY id",
+                self.before,
             )
         ]
 
@@ -294,13 +322,19 @@ class Trainer:
         assert self.process.wait(PATIENCE) == 0, self._log.read_text()
 
     def kill(self) -> None:
-        """As nobody should."""
+        """As nobody should. The server of its page lives on."""
         self.process.kill()
         self.process.wait()
 
 
-def end_server(run: Path) -> None:
-    """End the page of a run whose trainer was killed."""
-    if served := Served.find(run):
-        with suppress(ProcessLookupError):
-            os.kill(served.process, signal.SIGTERM)
+@contextmanager
+def ending(trainer: Trainer) -> Iterator[Trainer]:
+    """Leave nothing running of a trainer that has not done its work: neither it nor the server of its page."""
+    try:
+        yield trainer
+    finally:
+        if trainer.process.returncode != 0:
+            trainer.kill()
+            if served := Served.find(trainer.run):
+                with suppress(ProcessLookupError):
+                    os.kill(served.process, signal.SIGTERM)

@@ -43,7 +43,7 @@ def test_killed_in_a_stream_of_posts(tmp_path: Path):
     assert killed.kills == KILLS and killed.acknowledged > KILLS
     assert killed.cut_off > killed.done > 0, "the kills hit only before a post was carried out, or only after"
     report(
-        f"{KILLS:,} kills: of {killed.acknowledged:,} acknowledged posts 0 lost, 0 doubled; of {killed.cut_off:,} that were "
+        f"{KILLS:,} kills: of {killed.acknowledged:,} acknowledged posts 0 lost, 0 doubled; of {killed.cut_off:,} "
         f"cut off {killed.done:,} had been done; sent again, each was done once; integrity check clean",
         began,
     )

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -197,7 +197,14 @@ def _peak_gigabytes() -> float:
 
 
 def run(
-    method: str, preset_name: str, task: str, steps: int, runs: Sequence[int], device: str, json_file: Path | None
+    method: str,
+    preset_name: str,
+    task: str,
+    steps: int,
+    runs: Sequence[int],
+    device: str,
+    precision: Literal["float32", "bfloat16"],
+    json_file: Path | None,
 ) -> None:
     """`senior bench`: print the figures of one method or of all, and keep them as JSON where asked."""
     if steps < 1 or min(runs, default=0) < 1:
@@ -207,10 +214,12 @@ def run(
     if json_file:
         rundir.make_room(json_file)
     names = list(METHODS) if method == "all" else [method]
-    configs = [preset(preset_name, task, name) for name in names]
+    configs = [replace(preset(preset_name, task, name), precision=precision) for name in names]
     device = prepare_device(device)
     machine = _machine(program.spec_of(configs[0]), device)
-    print(f"{machine['device']}, {machine['threads']} threads, {machine['machine']}; {task}, {preset_name}")
+    print(
+        f"{machine['device']}, {machine['threads']} threads, {machine['machine']}; {task}, {preset_name}, {precision}"
+    )
     print(
         f"{'method':10} {'runs':>4} {'steps/s':>8} | {'act':>6} {'env':>6} {'update':>7} {'(floor)':>7} {'store':>6} "
         f"ms | {'pretraining':>11} /s | {'session':>8} {'relabel':>8} s | {'to start':>8} s | {'memory':>7} GB"
@@ -234,7 +243,7 @@ def run(
         "steps/s: of all runs together; milliseconds: per step of one run; memory: the process's peak so far; relabel: "
         "a full replay of a million rows; floor: see benchmarks/README.md"
     )
-    _keep(json_file, {"machine": machine, "task": task, "figures": found})
+    _keep(json_file, {"machine": machine, "task": task, "precision": precision, "figures": found})
 
 
 def run_environments(task: str, count: int, json_file: Path | None) -> None:

@@ -83,10 +83,6 @@ def check(config: Config) -> Config:
     ):
         _require(0 <= share <= 1, f"{name} must lie between 0 and 1, not {share}.")
     _require(
-        config.precision == "float32",
-        "--precision bfloat16 is not offered yet: its learning curves have not been compared with float32's.",
-    )
-    _require(
         math.isfinite(config.sac.target_entropy),
         f"--sac.target-entropy must be a number, not {config.sac.target_entropy}.",
     )

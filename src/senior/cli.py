@@ -153,6 +153,8 @@ class BenchOptions:
     options --task and --json are used then."""
     device: str = "auto"
     """auto, cpu or gpu."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Number format of the networks' products."""
     json: Path | None = None
     """Write the figures there too."""
 
@@ -410,6 +412,7 @@ def _bench(arguments: list[str]) -> int:
         options.steps,
         options.runs,
         options.device,
+        options.precision,
         options.json,
     )
     return DONE

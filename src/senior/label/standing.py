@@ -37,12 +37,15 @@ class Standing:
         """How everything stands, for one person."""
         progress = self.desk.progress()
         progress["labels"]["budget"] = self.config.queries.budget
+        doing, session = trainer(self.path), progress["labels"]["session"]
+        if doing["phase"] == "waiting" and session and session["done"] >= session["size"]:
+            doing["text"] = "All of this session is answered; training goes on in a moment."
         people = [{"name": who["name"], "answers": who["answers"]} for who in self.desk.annotators()]
         told = {
             "run": self.title,
             "goal": self.goal,
             **progress,
-            "trainer": trainer(self.path),
+            "trainer": doing,
             "annotators": people,
             "strength": True,
         }
@@ -51,7 +54,7 @@ class Standing:
     def turn(self, annotator: str, said: dict[str, Any] | None = None) -> dict[str, Any]:
         """The pair that somebody is to look at, or why there is none."""
         state = self.state(annotator)
-        phase, why = state["trainer"]["phase"], None
+        phase, labels, why = state["trainer"]["phase"], state["labels"], None
         # a session that nobody waited for may be left when training ends; its answers would teach nobody
         assignment = Assignment(None, [], "finished") if phase == "finished" else self.desk.assign(annotator)
         kind = assignment.kind
@@ -60,8 +63,10 @@ class Standing:
             why = {
                 "drawing": "The next clips are being drawn.",
                 "others": "The pairs that are left are for others to answer.",
-                "waiting": "There is nothing to answer now. The next pairs come when training has gone on.",
-                "finished": "All is done: training has finished. Thank you.",
+                "waiting": "Training goes on with them by itself."
+                if labels["done"] >= labels["budget"]
+                else "There is nothing to answer now. The next pairs come when training has gone on.",
+                "finished": "All is done: training has finished.",
                 "stopped": state["trainer"]["text"],
             }[kind]
         return {

@@ -126,7 +126,7 @@ function showPeople(annotators) {
   const seconds = (value) => (value === null ? null : `${value.toFixed(1)} s`);
   const rows = annotators.map((one) => [one.name, one.answers, one.equals, one.skips, seconds(one.median_seconds)]);
   if (!rows.length) rows.push(["Nobody yet", "", "", "", ""]);
-  table(byId("annotators"), "Answers of each person", ["Name", "Answers", "Equal", "Cannot tell", "Median"], rows);
+  table(byId("annotators"), "Answers of each person", ["Name", "Answers", "Equal", "Cannot tell", "Median time"], rows);
 }
 
 function showAgreement({ pairs, fleiss, cohen }) {

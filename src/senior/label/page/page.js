@@ -13,7 +13,7 @@ const TITLES = {
   waiting: "Nothing to label just now",
   drawing: "Clips are on their way",
   others: "Others have the rest",
-  finished: "All labels are given. Thank you.",
+  finished: "Training has finished. Thank you.",
   stopped: "Training has stopped",
 };
 const AWAY = 60_000; // ms out of sight after which the pair may have been leased to somebody else
@@ -102,7 +102,7 @@ async function ask() {
   if (reply === null || mine !== turns) return;
   if (reply.status === 200) {
     show(reply.data);
-    if (!events) listen();
+    if (!events && !isOver()) listen();
   } else if (turn === null) {
     askName(detailOf(reply.data));
   } else tell(detailOf(reply.data), "refused");
@@ -111,6 +111,7 @@ async function ask() {
 /** An answer, undo or redo: one at a time, under one id, until the server has acknowledged it. */
 async function act(path, fields, button) {
   if (saving || expired || !turn) return;
+  if (isOver()) return tell("Training has finished; no answer can be changed any more.", "refused");
   saving = true;
   turns += 1;
   button.classList.add("chosen");
@@ -166,6 +167,15 @@ function show(next) {
   player.prefetch([pair, ...turn.ahead]);
   showState(turn.state);
   showPair(pair);
+  if (isOver()) rest();
+}
+
+/** Nothing comes any more, and the server ends with the trainer: the page leaves it alone. */
+const isOver = () => turn?.kind === "finished";
+
+function rest() {
+  events?.close();
+  el.connection.hidden = true;
 }
 
 function pairShown() {
@@ -195,11 +205,17 @@ function showPair(pair) {
   el.note.textContent = (clips && pair.note) || "";
   el.empty.hidden = clips;
   el.empty.dataset.kind = turn.kind ?? "";
-  el["empty-title"].textContent = pair ? "This pair cannot be shown" : (TITLES[turn.kind] ?? "No pair");
+  el["empty-title"].textContent = pair ? "This pair cannot be shown" : titleOfNone();
   el["empty-why"].textContent = pair ? `${pair.note ?? ""} Choose “Cannot tell” to go on.` : turn.why;
   if (clips) el.seek.max = pair.frames - 1;
   setRate(rate);
   showReadiness();
+}
+
+function titleOfNone() {
+  const { done, budget } = turn.state.labels;
+  if (done >= budget && ["waiting", "finished"].includes(turn.kind)) return "All labels are given. Thank you.";
+  return TITLES[turn.kind] ?? "No pair";
 }
 
 /** data-state of the body says how far the page is: start, loading, ready, saving, broken, empty, expired. */
@@ -224,7 +240,7 @@ function showState(news) {
   el.labels.textContent = `${labels.done} of ${labels.budget} labels`;
   const { number, done, size } = labels.session ?? {};
   el.session.textContent = labels.session ? `session ${number}: ${done} of ${size}` : "";
-  el.pace.textContent = labels.per_hour === null ? "" : `${Math.round(labels.per_hour)} an hour`;
+  el.pace.textContent = labels.per_hour === null ? "" : `${Math.round(labels.per_hour).toLocaleString("en")} an hour`;
   el.trainer.textContent = clips.failure ?? trainer.text;
   el.dot.dataset.phase = clips.failure ? "stopped" : trainer.phase;
   el["empty-trainer"].textContent = turn.kind === "waiting" && trainer.text !== turn.why ? trainer.text : "";
@@ -290,12 +306,18 @@ function listen() {
   const mine = new EventSource(`/api/events?annotator=${encodeURIComponent(annotator)}`);
   events = mine;
   mine.onopen = () => (el.connection.hidden = true);
-  mine.addEventListener("state", (event) => showState(JSON.parse(event.data)));
+  mine.addEventListener("state", (event) => {
+    showState(JSON.parse(event.data));
+    if (state.trainer.phase !== "finished" || saving) return;
+    show({ ...turn, pair: null, ahead: [], kind: "finished", why: state.trainer.text, state });
+  });
   // Browsers differ in when they give up; closing and opening anew is the same in all of them.
   mine.onerror = async () => {
     mine.close();
+    if (isOver()) return;
     el.connection.hidden = false;
     await wait(1500);
+    if (events !== mine || isOver()) return;
     const refused = await fetch("/api/state").then((response) => response.status === 401, () => false);
     if (events !== mine || expired) return;
     if (refused) expire();
@@ -305,14 +327,13 @@ function listen() {
 
 /** A tab out of sight asks for nothing: it would lease pairs that others could answer. */
 function poll() {
-  const done = turn?.kind === "finished" || turn?.kind === "stopped";
-  if (!document.hidden && turn && !turn.pair) ask();
-  setTimeout(poll, done ? 5000 : 1000);
+  if (!document.hidden && turn && !turn.pair && !isOver()) ask();
+  setTimeout(poll, turn?.kind === "stopped" ? 5000 : 1000);
 }
 
 /** After a sleep or a way back in history the connection may be dead without knowing. */
 function comeBack() {
-  if (!events || expired) return;
+  if (!events || expired || isOver()) return;
   listen();
   ask();
 }
