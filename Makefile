@@ -69,5 +69,5 @@ lock:  ## pin the dependencies again (ARGS=--upgrade for the newest)
 	@PATH="$(CURDIR)/build/lock/bin:$$PATH" $(LOCK_WITH) $(ARGS) -o requirements.lock --quiet
 
 clean:  ## remove .venv and everything built; runs/ is kept
-	rm -rf .venv build dist .pytest_cache .ruff_cache
+	rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

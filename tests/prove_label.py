@@ -63,4 +63,4 @@ def test_requests_of_all_kinds(tmp_path: Path):
             assert run.sql("PRAGMA integrity_check") == [("ok",)]
         print(f"{i + 2 * AT_ONCE:,} requests: {dict(sorted(found.items()))}", flush=True)
     assert not [status for status in found if status >= 500]
-    report(f"{found.total():,} answers, 0 of 5xx: {dict(sorted(found.items()))} (0: none came)", began)
+    report(f"{found.total():,} requests, 0 answers of 5xx: {dict(sorted(found.items()))} (0: none came)", began)

@@ -78,21 +78,19 @@ class StandIn:
         self._other.close()
         self.preferences.close()
 
-    def ask(
-        self, pairs: int, reserves: int = 0, left: Sequence[int] | None = None, drawn: bool = True, session: int = -1
-    ) -> list[int]:
-        """Ask another session, or more of one; ``left``: which segment of each pair is shown there, else alternating.
+    def ask(self, pairs: int, reserves: int = 0, left: Sequence[int] | None = None, drawn: bool = True) -> list[int]:
+        """Ask another session; ``left``: which segment of each pair is shown there, else alternating.
 
         Returns the pairs' numbers, those of the reserves last.
         """
-        number, n = self.sessions if session < 0 else session, pairs + reserves
+        number, n = self.sessions, pairs + reserves
         rng = np.random.default_rng(number)
         segments = [rng.normal(size=(n, 2, H, *size)).astype(np.float32) for size in ((O,), (A,), ())]
         places = [rng.integers(100, size=(n, 2)) for _ in range(2)]
         shown = np.arange(n) % 2 if left is None else np.array(left)
         query = Query(Pairs(*segments, *places), {"m": rng.normal(size=n)}, rng.random(n))
         ids = self.preferences.add(query, number, 1000 * (number + 1), 0, shown, reserves)
-        self.sessions = max(self.sessions, number + 1)
+        self.sessions += 1
         if drawn:
             self.draw(ids)
         return ids

@@ -350,6 +350,21 @@ def test_the_last_answer_can_be_thought_over_before_a_session_is_ready(opened: O
     assert preferences.ready(0, STEP, ONE, settle=60)
 
 
+def test_what_was_undone_in_the_last_moment_is_not_collected(opened: Opener, file: Path):
+    """The page undoes an answer after the trainer has found the session ready."""
+    preferences, query = opened(), query_of(2)
+    ask(preferences, query)
+    say(preferences, [1, 2], [FIRST, SECOND])
+    assert preferences.ready(0, STEP, ONE)
+    sql(file, "UPDATE answers SET withdrawn = 1 WHERE pair = 2")
+    assert not preferences.collect(0, STEP, ONE)
+    assert_holds(preferences, query, [], [])
+    assert [row["collected_step"] for row in preferences.asked()] == [None, None]
+    sql(file, "UPDATE answers SET withdrawn = NULL WHERE pair = 2")
+    assert preferences.collect(0, STEP, ONE)
+    assert_holds(preferences, query, [0, 1], [0, 1])
+
+
 def test_collecting_twice_changes_nothing(opened: Opener, file: Path):
     """Not even where an answer changed in between, as it cannot by the page, or the rules did."""
     preferences, query = opened(), query_of(4)

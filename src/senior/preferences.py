@@ -409,18 +409,24 @@ class Preferences:
         latest = max((one.answered_at for pair in chosen for one in pair.said), default=0.0)
         return all(pair.complete(rules) for pair in chosen) and time.time() - latest >= settle
 
-    def collect(self, session: int, step: int, rules: Rules) -> None:
+    def collect(self, session: int, step: int, rules: Rules) -> bool:
         """Take the answers to a session as they stand: from now on they are trained on, and cannot be undone.
 
-        One that was collected before stays as it was. `read` is told of one session more afterwards.
+        False, and nothing is taken, where one was undone since it was `ready`. A session that was collected before
+        stays as it was. The arrays then hold one session more.
         """
         with transaction(self._db):
-            pairs = pairs_of(self._db, "session = ? AND collected_step IS NULL", session)
-            self._db.executemany(
-                "UPDATE pairs SET collected_step = ?, second = ? WHERE id = ?",
-                [(step, pair.second(rules), pair.id) for pair in asked_of(pairs, rules)],
-            )
+            pairs = pairs_of(self._db, "session = ?", session)
+            if all(pair.collected_step is None for pair in pairs):
+                chosen = asked_of(pairs, rules)
+                if not all(pair.complete(rules) for pair in chosen):
+                    return False
+                self._db.executemany(
+                    "UPDATE pairs SET collected_step = ?, second = ? WHERE id = ?",
+                    [(step, pair.second(rules), pair.id) for pair in chosen],
+                )
         self.read(session + 1)
+        return True
 
     def read(self, sessions: int) -> None:
         """Fill the arrays with the labels of so many sessions, from the first one on."""

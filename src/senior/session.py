@@ -35,15 +35,13 @@ def hold(
     if not ask(trainee, runs, i, step, n, warn):
         return None
     refused, first = listen(trainee), True
-    while not refused and not trainee.answered(step):
+    while not refused and not (trainee.answered(step) and learn(trainee, runs, i, step, warn)):
         if not (trainee.config.asking.wait or trainee.progress.collected == 0):
             return None
         if not pause(first):
             trainee.done = True
             return None
         refused, first = listen(trainee), False
-    if not refused:
-        learn(trainee, runs, i, step, warn)
     return refused
 
 
@@ -123,11 +121,15 @@ def listen(trainee: Trainee) -> str | None:
         preferences.answer(answers, trainee.config.teacher)
 
 
-def learn(trainee: Trainee, runs: Runs, i: int, step: int, warn: Warn) -> None:
-    """Collect the session under way, all of which is answered, and fit the reward model to all labels so far."""
+def learn(trainee: Trainee, runs: Runs, i: int, step: int, warn: Warn) -> bool:
+    """Collect the session under way, all of which is answered, and fit the reward model to all labels so far.
+
+    False, and nothing is done, where an answer was undone in the last moment.
+    """
     learner, progress, preferences = trainee.learner, trainee.progress, trainee.preferences
     informed = progress.labels > 0
-    preferences.collect(progress.collected, step, trainee.rules)
+    if not preferences.collect(progress.collected, step, trainee.rules):
+        return False
     _judge_predictions(progress, preferences.judged(progress.collected), informed, warn)
     progress.collected += 1
     progress.labels = preferences.arrays.count
@@ -137,6 +139,7 @@ def learn(trainee: Trainee, runs: Runs, i: int, step: int, warn: Warn) -> None:
         progress.latest.update({name: float(value) for name, value in info.items()})
         positions, count = preferences.preferred_positions(trainee.spec.position, trainee.config.pge.equal)
         runs.one(i, learner.on_session, positions, np.int32(count), at)
+    return True
 
 
 def _judge_predictions(
