@@ -236,7 +236,7 @@ class Lived:
         )
         while self.sql(missing) != [(0,)]:
             assert time.monotonic() < until
-            time.sleep(0.02)
+            time.sleep(0.1)
 
     def collect(self) -> None:
         """Train on the earliest session that is not collected."""

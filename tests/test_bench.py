@@ -28,8 +28,7 @@ def test_a_method_is_measured(method: str, tmp_path: Path):
     rare = ["pretraining_steps_per_second", "session_seconds", "relabel_seconds"]
     assert all(figures[name] > 0 for name in (*positive, *(rare if learns else ())))
     assert learns or not set(rare) & set(figures)
-    # with waiting, a step's parts take about as long as a step
-    assert 0.2 < figures["steps_per_second"] * sum(figures["milliseconds"].values()) / 1e3 < 5
+    assert all(milliseconds > 0 for milliseconds in figures["milliseconds"].values())
 
 
 def test_the_operations_of_an_update_are_counted():

@@ -117,7 +117,7 @@ def test_a_session_without_episodes_is_told(tmp_path: Path):
     training, said = two_runs(tmp_path)
     training.trainees[0].progress.recent = [[0, 0, 50]]
     for _ in range(2):
-        assert not session.hold(training.trainees[0], training.runs, 0, 400, 10, partial(training.warn, 0))
+        assert not session.ask(training.trainees[0], training.runs, 0, 400, 10, partial(training.warn, 0))
     (sentence,) = said.sentences
     assert "session at step 400 is put off" in sentence
     assert training.trainees[0].progress.queried == 0
