@@ -142,6 +142,7 @@ NUMBERS = {
     "--reward.snippets 5": "Windows of 35 to 45 steps do not fit into segments of 10",
     "--replay-capacity 0": "--replay-capacity must be at least 1",
     "--replay-capacity 10000": "cannot hold pre-training's 10000 steps",
+    "--precision bfloat16": "--precision bfloat16 is not offered: its learning curves do not agree",
     "--device gpu": "--device gpu: JAX finds no GPU here",
 }
 

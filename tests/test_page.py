@@ -165,7 +165,7 @@ def test_a_session_by_keyboard(run: Lived, enter: Enter):
         if number == 1:  # once to the end, and again
             assert kim.page.locator("video").count() == 2 * (1 + 3), "the next three pairs are loaded beforehand"
             kim.wait(f"#frame:text-is('{H} / {H}')")
-            kim.wait(f"#frame:text-is('1 / {H}')")
+            kim.wait(f"#frame:not(:text-is('{H} / {H}'))")
         assert kim.press(key) == f"Saved: {saved(answer, strength)}"
         assert kim.text("labels") == f"{run.before + number} of {BUDGET} labels"
         assert kim.text("session") == f"session {run.sessions}: {number} of {len(KEYS)}"
@@ -357,11 +357,15 @@ def test_playing(run: Lived, enter: Enter):
     for key, rate, pressed in (("]", 2, "two"), ("[", 1, "one"), ("[", 0.5, "half"), ("]", 1, "one")):
         ann.page.keyboard.press(key)
         ann.wait(f"#rate-{pressed}[aria-pressed=true]")
-        ann.page.wait_for_timeout(150)
-        (_, left), (_, right) = ann.page.evaluate(times)
-        assert all(rate <= now < 1.2 * rate for now in (left, right)), "one may catch up with the other"
-    for _ in range(3):  # stopped anywhere, both stand at one frame
-        ann.wait(f"#frame:text-is('{H - 2} / {H}')")
+        for _ in range(50):  # a busy machine takes its time; one may catch up with the other
+            ann.page.wait_for_timeout(150)
+            (_, left), (_, right) = ann.page.evaluate(times)
+            if all(rate <= now < 1.2 * rate for now in (left, right)):
+                break
+        else:
+            raise AssertionError(f"at rate {rate} the clips play at {left} and {right}")
+    for soon in (300, 500, 700):  # stopped anywhere, both stand at one frame
+        ann.page.wait_for_timeout(soon)
         ann.page.keyboard.press("Space")
         ann.wait("#play[aria-label=Play]")
         ann.page.wait_for_timeout(100)

@@ -310,7 +310,7 @@ class Config:
     device: Literal["auto", "cpu", "gpu"] = "auto"
     """Where to compute. gpu: an error if there is none."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Number format of the products in actor and critics. bfloat16 sums in float32; weights stay float32."""
+    """Number format of the products in actor and critics. bfloat16 is not offered (results/precision)."""
 
     @property
     def window(self) -> int:
