@@ -276,7 +276,7 @@ def test_undo_and_redo_in_any_order(run: Lived, enter: Enter):
         una.press("ArrowLeft")
         standing.append((pair, "left", "clearly"))
     run.collect()
-    assert una.press("z") == "Your last answer has been trained on already, so it cannot be undone."
+    assert una.press("z") == "Your last answer belongs to what has been trained on already; it cannot be undone."
     assert una.text("labels") == f"{run.before + len(ids)} of {BUDGET} labels"
     una.forgive(REFUSED)
     targets = {0: 0.0, 1: 1.0, -1: 0.5, None: None}

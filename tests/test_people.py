@@ -341,3 +341,22 @@ def test_what_cannot_be_lived_through_again_is_filmed_and_shown(tmp_path: Path, 
     with person(run):
         (result,) = resume(run, Stop())
     assert result.finished and result.labels == 25
+
+
+def test_a_session_that_was_put_off_is_put_off_again(tmp_path: Path):
+    """Killed after a session that came later than it was due, before a checkpoint: it comes at the same step again."""
+    config = replace(short(), horizon=300, checkpoint_every=350)
+
+    class Breaks(Stop):
+        def advance(self, step: int, trainees: object) -> None:
+            if step == 650:
+                raise KeyboardInterrupt
+
+    train(config, tmp_path / "whole", watcher=Stop())
+    with pytest.raises(KeyboardInterrupt):
+        train(config, tmp_path / "broken", watcher=Breaks())
+    run = tmp_path / "broken" / "seed-0"
+    assert [row[:3] for row in labels(run)] == [(0, 600, 600)] * 10
+    (result,) = resume(run, Stop())
+    assert result.finished
+    assert_same_learning(run, tmp_path / "whole" / "seed-0")

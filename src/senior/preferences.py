@@ -354,6 +354,11 @@ class Preferences:
                 [[answer[name] for name in ("pair", *ANSWER)] for answer in answers],
             )
 
+    def foretold(self, session: int) -> bool:
+        """Whether what the model predicted of all its pairs is recorded."""
+        missing = "SELECT 1 FROM pairs WHERE session = ? AND prediction IS NULL LIMIT 1"
+        return self._db.execute(missing, (session,)).fetchone() is None
+
     def foretell(self, ids: Sequence[int], second: np.ndarray) -> None:
         """Record what the model predicts ``[n]`` of pairs that were chosen without it: P(second preferred)."""
         with transaction(self._db):
@@ -395,16 +400,16 @@ class Preferences:
                 [(annotator, label, now, number) for number, label in zip(answers.ids, answers.labels, strict=True)],
             )
 
-    def ready(self, session: int, step: int, rules: Rules, settle: float = 0.0) -> bool:
+    def ready(self, session: int, step: int, rules: Rules, settle: float = 0.0, waited_for: bool = False) -> bool:
         """Whether a session can be collected at ``step``.
 
         All of it is answered, the last answer at least ``settle`` seconds old, so that it could be undone; or it was
-        collected at that very step before, in a life of the run that did not last.
+        collected before, in a life of the run that did not last, and its step has come or the run would stand still.
         """
         pairs = pairs_of(self._db, "session = ?", session)
         before = [pair.collected_step for pair in pairs if pair.collected_step is not None]
         if before:
-            return before[0] == step
+            return waited_for or before[0] <= step
         chosen = asked_of(pairs, rules)
         latest = max((one.answered_at for pair in chosen for one in pair.said), default=0.0)
         return all(pair.complete(rules) for pair in chosen) and time.time() - latest >= settle

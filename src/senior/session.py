@@ -20,6 +20,8 @@ from senior.types import Pairs, Preferred, Query
 
 Warn = Callable[[str, str | None], None]
 """Tells a warning of a kind, if there is one."""
+Drawn = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Rows, episodes and first steps of candidate pairs (`Trainee.candidate_starts`)."""
 
 
 def hold(
@@ -35,8 +37,9 @@ def hold(
     if not ask(trainee, runs, i, step, n, warn):
         return None
     refused, first = listen(trainee), True
-    while not refused and not (trainee.answered(step) and learn(trainee, runs, i, step, warn)):
-        if not (trainee.config.asking.wait or trainee.progress.collected == 0):
+    must_wait = trainee.config.asking.wait or trainee.progress.collected == 0
+    while not refused and not (trainee.answered(step, must_wait) and learn(trainee, runs, i, step, warn)):
+        if not must_wait:
             return None
         if not pause(first):
             trainee.done = True
@@ -48,16 +51,21 @@ def hold(
 def ask(trainee: Trainee, runs: Runs, i: int, step: int, n: int, warn: Warn) -> bool:
     """Put ``n`` pairs of run ``i`` of ``runs`` into its preference file; False: put off, there are no episodes yet."""
     progress, preferences = trainee.progress, trainee.preferences
+    drawn = trainee.candidate_starts(step)
+    if drawn is None:
+        warn(
+            f"session at {step}",
+            f"The session at step {step} is put off: fewer than two complete episodes are longer than a segment of "
+            f"{trainee.config.queries.segment} steps.",
+        )
+        return False
     held = preferences.session(progress.sessions)
-    if held and parts.is_recorded(trainee.config):
+    if held and not preferences.foretold(progress.sessions):  # taken over from another run
         put = preferences.query(held, trainee.reward_per_step()).pairs
         summed = runs.one(i, trainee.learner.summed_rewards, put.observation, put.action)
         preferences.foretell(held, probability_second(np.asarray(summed).mean(axis=0)))
     if not held:
-        chosen = _choose(trainee, runs, i, step, n, warn)
-        if chosen is None:
-            return False
-        query, reserves = chosen
+        query, reserves = _choose(trainee, runs, i, step, n, drawn, warn)
         sides = trainee.rng(Purpose.SIDES, step).integers(2, size=len(query.pairs))
         actions = np.asarray(runs.view(i, lambda run: run.replay.facts.action))
         episodes = trainee.episodes_of(query.pairs, actions)
@@ -68,17 +76,9 @@ def ask(trainee: Trainee, runs: Runs, i: int, step: int, n: int, warn: Warn) -> 
     return True
 
 
-def _choose(trainee: Trainee, runs: Runs, i: int, step: int, n: int, warn: Warn) -> tuple[Query, int] | None:
-    """Pairs to ask, best first, and how many of them are only in reserve."""
+def _choose(trainee: Trainee, runs: Runs, i: int, step: int, n: int, drawn: Drawn, warn: Warn) -> tuple[Query, int]:
+    """Pairs to ask, best first, of those ``drawn``, and how many of them are only in reserve."""
     learner, progress = trainee.learner, trainee.progress
-    drawn = trainee.candidate_starts(step)
-    if drawn is None:
-        warn(
-            f"session at {step}",
-            f"The session at step {step} is put off: fewer than two complete episodes are longer than a segment of "
-            f"{trainee.config.queries.segment} steps.",
-        )
-        return None
     starts, episodes, first_steps = drawn
     observation, action, reward = (np.asarray(column) for column in runs.one(i, learner.cut, starts))
     pool = Pairs(observation, action, reward, episodes, first_steps)

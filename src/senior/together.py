@@ -125,7 +125,8 @@ def train_waiting(
     try:
         for trainee, _ in waiting:
             if trainee.config.teacher == "human":
-                trainee.tell("starting", 0)
+                standing = checkpoint.standing(trainee.directory.checkpoints) or {}
+                trainee.tell("starting", standing.get("step", 0))
                 pages.enter_context(Serving(trainee.directory.path, page, watcher.say))
         while left and not (results and watcher.stop):
             device = left[0].trainee.config.device
@@ -153,6 +154,8 @@ def _train_batch(batch: Sequence[Waiting], watcher: Watcher, lift: Lift, alone: 
             try:
                 run = opened()
             except BadInput as error:
+                trainee.failure = str(error)
+                trainee.tell("stopped", trainee.progress.step)
                 if alone:
                     raise
                 results[trainee.directory.path] = unopened(trainee.directory.path, error, watcher)

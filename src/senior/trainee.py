@@ -328,10 +328,10 @@ class Trainee:
         """Whether a session was asked that is not yet learned from."""
         return self.progress.collected < self.progress.sessions
 
-    def answered(self, step: int) -> bool:
-        """Whether the session under way can be learned from at ``step``."""
+    def answered(self, step: int, waited_for: bool = False) -> bool:
+        """Whether the session under way can be learned from at ``step``; ``waited_for``: the run stands still."""
         settle = self.config.asking.settle if self.config.teacher == "human" else 0.0
-        return self.preferences.ready(self.progress.collected, step, self.rules, settle)
+        return self.preferences.ready(self.progress.collected, step, self.rules, settle, waited_for)
 
     def evaluation_episodes(self, step: int) -> range:
         """Numbers of the episodes of the evaluation at ``step``; no two evaluations share one."""

@@ -137,7 +137,7 @@ class Desk:
             return Outcome(refused="There is no answer of yours to undo.")
         number, pair, said = latest
         if not self._is_open(pair):
-            return Outcome(refused="Your last answer has been trained on already, so it cannot be undone.")
+            return Outcome(refused="Your last answer belongs to what has been trained on already; it cannot be undone.")
         self._db.execute(
             "UPDATE answers SET withdrawn = 1 + (SELECT COALESCE(MAX(withdrawn), 0) FROM answers WHERE annotator = ?) "
             "WHERE id = ?",
@@ -347,7 +347,8 @@ class Desk:
         """
         with self._lock:
             rows: Sequence[tuple[int, int, float, float]] = self._db.execute(
-                "SELECT session, collected_step, prediction, second FROM pairs WHERE session > 0 "
+                "SELECT session, collected_step, prediction, second FROM pairs "
+                "WHERE session > (SELECT MIN(session) FROM pairs WHERE second IS NOT NULL) "
                 "AND second IS NOT NULL AND second != 0.5 AND prediction IS NOT NULL ORDER BY id"
             ).fetchall()
         found = []

@@ -89,7 +89,7 @@ class Guard:
             await self.app(scope, receive, send_guarded)
         except Exception:
             if not begun:
-                told = {"detail": "The server failed; nothing was saved. It says why where it was started."}
+                told = {"detail": "The server failed; nothing was saved. The run's label/server.log says why."}
                 await JSONResponse(told, 500)(scope, receive, send_guarded)
             raise
 

@@ -87,6 +87,8 @@ def serve(run: Path, address: Address, owner: str) -> Served:
     """Serve a run until SIGINT or SIGTERM. Where another process serves it already, returns at once where that is."""
     folder = run / "label"
     config = load(run / "config.json")
+    if config.teacher != "human":
+        raise BadInput(f"The run in {run} is answered by {config.teacher}, not by people (--teacher human).")
     if not config.method.learns_reward:
         raise BadInput(f"The run in {run} learns from the true reward; nobody is asked anything.")
     if address.token and not PLAIN.fullmatch(address.token):
@@ -112,6 +114,8 @@ def _serve_alone(run: Path, config: Config, address: Address, owner: str) -> Ser
     before = Served.find(run)
     (folder / "server.json").unlink(missing_ok=True)  # of a server that is gone
     token = _token(folder, address.token)
+    if owner == "user" and not _has_tables(run / "preferences.sqlite"):
+        print("The run has not begun; the page is served when it does.", flush=True)
     while not _has_tables(run / "preferences.sqlite"):
         time.sleep(0.2)
     listening = _bind(address, before.port if before else None)

@@ -124,22 +124,28 @@ class Serving:
     def _keep(self) -> None:
         told = json.dumps({**asdict(self._address), "owner": "trainer"})
         command = [sys.executable, "-m", "senior.label.server", str(self.run), told]
+        folder = self.run / "label"
+        folder.mkdir(exist_ok=True)
+        complained = ""
         while not self._over.is_set():
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-                start_new_session=True,  # an interrupt at the keyboard is the trainer's, which then ends the server
-            )
-            if self._over.is_set():
-                self._process.terminate()
-            assert self._process.stdout is not None
-            url = self._process.stdout.readline().strip()
-            if url:
-                self._tell(url)
-            _, complaint = self._process.communicate()
+            with open(folder / "server.log", "w+") as log:
+                self._process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    stderr=log,
+                    text=True,
+                    start_new_session=True,  # an interrupt at the keyboard is the trainer's, which then ends the server
+                )
+                if self._over.is_set():
+                    self._process.terminate()
+                assert self._process.stdout is not None
+                url = self._process.stdout.readline().strip()
+                if url:
+                    self._tell(url)
+                self._process.communicate()
+                log.seek(0)
+                complaint = (log.read().strip().splitlines() or ["it said nothing"])[-1]
             if self._over.is_set():
                 return
             if self._process.returncode == SERVED:
@@ -147,11 +153,12 @@ class Serving:
                 while _serves(self.run) and not self._over.wait(0.5):
                     pass
             elif self._process.returncode == BAD_INPUT:
-                self._say(
-                    f"The labelling page is not served: {complaint.strip()} Serve it with: senior label {self.run}"
-                )
+                self._say(f"The labelling page is not served: {complaint} Serve it with: senior label {self.run}")
                 return
             else:
+                if self._process.returncode > 0 and complaint != complained:  # else it was killed
+                    self._say(f"The labelling page's server ended and is started again: {complaint}")
+                    complained = complaint
                 self._over.wait(0.5)
 
     def _tell(self, url: str) -> None:

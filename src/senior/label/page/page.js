@@ -102,7 +102,7 @@ async function ask() {
   if (reply === null || mine !== turns) return;
   if (reply.status === 200) {
     show(reply.data);
-    if (!events && !isOver()) listen();
+    if (!events) listen();
   } else if (turn === null) {
     askName(detailOf(reply.data));
   } else tell(detailOf(reply.data), "refused");
@@ -167,16 +167,10 @@ function show(next) {
   player.prefetch([pair, ...turn.ahead]);
   showState(turn.state);
   showPair(pair);
-  if (isOver()) rest();
 }
 
-/** Nothing comes any more, and the server ends with the trainer: the page leaves it alone. */
+/** Nothing comes any more, and the server ends with the trainer: the page does not ask for it. */
 const isOver = () => turn?.kind === "finished";
-
-function rest() {
-  events?.close();
-  el.connection.hidden = true;
-}
 
 function pairShown() {
   if (measuring) window.senior.latencies.push(performance.measure("key to clip", "answer").duration);
