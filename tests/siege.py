@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from senior.types import Answers
 from tests.stand_in import Client, Reply, Server, StandIn, new_id, raw
 
 # Kills.
@@ -182,6 +183,8 @@ def _train(run: StandIn, posters: Sequence[Poster]) -> None:
     left = dict(run.sql("SELECT id, shown_left FROM pairs"))
     said = sorted(told for poster in posters for told in poster.standing if told[1] != "skip")
     before = run.preferences.arrays.count
+    left_over = run.preferences.unanswered(run.collected, run.rules)
+    run.preferences.answer(Answers(left_over, [None] * len(left_over)), "nobody")
     run.collect()
     _, _, labels, count = run.preferences.arrays
     turned = [second[answer] if answer == "equal" or not left[pair] else 1 - second[answer] for pair, answer in said]

@@ -117,7 +117,7 @@ class StandIn:
 
     def collect(self) -> None:
         """Train on the earliest session that is not collected, as its answers stand."""
-        self.preferences.collect(self.collected, self.step, self.rules)
+        assert self.preferences.collect(self.collected, self.step, self.rules), "an answer is missing"
         self.collected += 1
 
     @property
