@@ -25,7 +25,8 @@ from senior import envs
 from senior.config import Config, made_by, to_json
 from senior.envs.episodes import TRAINING, episode_seed
 from senior.label.serving import Served
-from senior.preferences import Preferences, Rules
+from senior.preference_file import Rules
+from senior.preferences import Preferences
 from senior.types import Pairs, Query
 from tests.stand_in import ROOT
 

@@ -26,7 +26,8 @@ import numpy as np
 
 from senior.config import Asking, Config, Queries, to_json
 from senior.label.serving import Address
-from senior.preferences import Preferences, Rules, connect
+from senior.preference_file import connect
+from senior.preferences import Preferences
 from senior.presets import preset
 from senior.types import Pairs, Query
 
@@ -50,7 +51,7 @@ class StandIn:
     def __init__(self, path: Path, asking: Asking = PAPER, capacity: int = CAPACITY) -> None:
         self.path = path
         self.config = configured(asking)
-        self.rules = Rules(asking.overlap, asking.replace_skipped, asking.soft_labels)
+        self.rules = asking.rules
         self.clips = path / "label" / "clips"
         self.clips.mkdir(parents=True)
         (path / "config.json").write_text(json.dumps({"config": to_json(self.config), "protocol": {}}))

@@ -19,7 +19,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from senior.config import Asking
 from senior.label.desk import AHEAD, LEASE_SECONDS, Assignment, Desk, Given, Outcome
-from senior.preferences import Rules
+from senior.preference_file import Rules
 from tests.stand_in import PAPER, StandIn, new_id
 
 FIRST, SECOND, EQUAL = 0, 1, -1

@@ -21,7 +21,8 @@ from senior.config import Asking, Config
 from senior.files import pack, unpack
 from senior.label_file import read
 from senior.labels import describe, export_labels, import_into, import_labels, pairs_in, stats
-from senior.preferences import ANSWER, PAIR, Preferences, Rules, connect
+from senior.preference_file import ANSWER, PAIR, Rules, connect
+from senior.preferences import Preferences
 from senior.rundir import RunDirectory
 from senior.teachers.recorded import SUFFIX, Recorded
 from senior.types import Answers, BadInput, Pairs, Query

@@ -23,9 +23,8 @@ import pytest
 from senior.checkpoint import steps, unpack
 from senior.config import Asking, Config
 from senior.label.desk import Desk, Given, Side
-from senior.label.server import _has_tables
 from senior.labels import export_labels
-from senior.preferences import Rules, asked_of, connect, pairs_of
+from senior.preference_file import Rules, asked_of, connect, has_tables, pairs_of
 from senior.program import resume, train
 from senior.types import BadInput
 from tests.equal import OPTIONS, assert_same_run, short
@@ -45,7 +44,7 @@ def better(returns: np.ndarray) -> Side:
 def answer_open(run: Path, judge: Judge, rules: Rules = RULES, annotator: str = "ann", most: int = 10**6) -> int:
     """Answer what is asked in a run now and drawn, ``most`` pairs at most; returns how many were."""
     file = run / "preferences.sqlite"
-    if not _has_tables(file):
+    if not has_tables(file):
         return 0
     db, desk, done = connect(file), Desk(file, rules), 0
     try:

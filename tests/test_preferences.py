@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from senior.preferences import SCHEMA_VERSION, Preferences, Rules, connect, transaction
+from senior.preference_file import SCHEMA_VERSION, Rules, connect, transaction
+from senior.preferences import Preferences
 from senior.types import Answers, BadInput, Pairs, Preferred, Query
 
 CAPACITY, H, O, A = 6, 4, 5, 2

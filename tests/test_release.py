@@ -16,7 +16,8 @@ from senior.checks import check
 from senior.config import SAC
 from senior.learner import Learner, Purpose, Run
 from senior.methods import METHODS
-from senior.preferences import Preferences, Rules
+from senior.preference_file import Rules
+from senior.preferences import Preferences
 from senior.presets import release
 from senior.program import make_learner
 from senior.replay import Fact

@@ -15,6 +15,7 @@ import cattrs
 import tyro
 
 from senior.methods import Method
+from senior.preference_file import Rules
 from senior.types import BadInput
 
 _FLAT = tyro.conf.arg(name="")
@@ -250,6 +251,11 @@ class Asking:
     """Train "slightly better" towards 0.75 instead of 1."""
     settle: float = 3.0
     """Seconds in which the last answer of a session can still be undone."""
+
+    @property
+    def rules(self) -> Rules:
+        """What answers amount to."""
+        return Rules(self.overlap, self.replace_skipped, self.soft_labels)
 
 
 @dataclass(frozen=True)

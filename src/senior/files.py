@@ -25,12 +25,26 @@ def write_atomically(path: Path, data: bytes) -> None:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
-    os.replace(temporary, path)
-    directory = os.open(path.parent, os.O_RDONLY)
+    _rename(temporary, path)
+
+
+def put(unfinished: Path, path: Path) -> None:
+    """Give a file that is written its name: all of it is there or nothing, whatever happens to the machine."""
+    _sync(unfinished)
+    _rename(unfinished, path)
+
+
+def _rename(unfinished: Path, path: Path) -> None:
+    os.replace(unfinished, path)
+    _sync(path.parent)
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(directory)
+        os.fsync(handle)
     finally:
-        os.close(directory)
+        os.close(handle)
 
 
 def pack(arrays: dict[str, np.ndarray], compress: bool = False) -> bytes:

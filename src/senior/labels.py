@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from senior.config import Config, load
+from senior.config import load
 from senior.label import agreement
 from senior.label.desk import Desk
 from senior.label_file import SEGMENTS, Labels, read, shapes, write
-from senior.preferences import ANSWER, PAIR, Preferences, Rules, asked_of, connect, pairs_of
+from senior.preference_file import ANSWER, PAIR, asked_of, connect, pairs_of
+from senior.preferences import Preferences
 from senior.rundir import RunDirectory, read_protocol, told
 from senior.types import BadInput, Preferred
 
@@ -190,11 +191,10 @@ def stats(run: Path) -> dict[str, Any]:
     annotators: per person name, answers, skips, equals, median_seconds (of the answers whose time is known, or None).
     agreement: see `senior.label.agreement.summary`. Raises `BadInput` if the run cannot be read.
     """
-    rules = _rules(load(run / "config.json"))
+    rules = load(run / "config.json").asking.rules
     with _reading(run) as db:
         pairs = pairs_of(db, "1")
-    sessions = dict.fromkeys(pair.session for pair in pairs)
-    asked = [pair for number in sessions for pair in asked_of([one for one in pairs if one.session == number], rules)]
+    asked = asked_of(pairs, rules)
     answered = [pair for pair in asked if pair.complete(rules)]
     opinions = [{one.answer for one in pair.said} - {None} for pair in answered]
     with closing(Desk(RunDirectory(run).preferences, rules)) as desk:
@@ -209,11 +209,6 @@ def stats(run: Path) -> dict[str, Any]:
             "annotators": desk.annotators(),
             "agreement": agreement.summary(desk.said()),
         }
-
-
-def _rules(config: Config) -> Rules:
-    asking = config.asking
-    return Rules(asking.overlap, asking.replace_skipped, asking.soft_labels)
 
 
 def describe(found: Mapping[str, Any]) -> str:

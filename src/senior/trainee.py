@@ -17,7 +17,7 @@ from senior.envs.episodes import EVALUATION, TRAINING, Episodes, Failure, Local,
 from senior.envs.recording import Recording, repeats_itself
 from senior.envs.workers import Remote, Worker
 from senior.learner import Learner, Purpose, Run
-from senior.preferences import Preferences, Rules
+from senior.preferences import Preferences
 from senior.reward.bilevel import FirstSteps
 from senior.reward.model import Labelled
 from senior.rundir import RunDirectory, told
@@ -81,8 +81,7 @@ class Trainee:
         self.judged_in = self._place(EVALUATION, worker)
         self.rule = parts.selection(config) if config.method.learns_reward else None
         self.teacher = parts.teacher(config)
-        asking = config.asking
-        self.rules = Rules(asking.overlap, asking.replace_skipped, asking.soft_labels)
+        self.rules = config.asking.rules
         self._told: tuple[str, float, int] = ("", 0.0, 0)  # phase, time and step of what people were told last
         self.put: set[int] = set()  # pairs of the session under way that were put to the teacher
         self._preferences: Preferences | None = None
@@ -228,10 +227,11 @@ class Trainee:
 
         phase: starting, pretraining, training, waiting (for answers), evaluating, finished or stopped.
         """
-        now = time.time()
-        if self.config.teacher != "human" or (phase == self._told[0] and now - self._told[1] < 0.5):
+        if self.config.teacher != "human":
             return
-        _, last, at = self._told
+        now, (before, last, at) = time.time(), self._told
+        if phase == before and now - last < 0.5:
+            return
         rate = (step - at) / (now - last) if step > at and last else None
         self._told = phase, now, step
         self.directory.tell(

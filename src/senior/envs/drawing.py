@@ -21,6 +21,7 @@ import numpy as np
 
 from senior.envs import make
 from senior.envs.metaworld import TASKS, MetaWorld
+from senior.files import put
 
 INSTALL = (
     "install libegl1 and libgl1-mesa-dri (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri) "
@@ -224,18 +225,3 @@ class Film:
                 self.finish()
         finally:
             self.discard()
-
-
-def put(unfinished: Path, out: Path) -> None:
-    """Rename a written file, so that either all of it is there or nothing, whatever happens to the machine."""
-    _sync(unfinished)
-    unfinished.replace(out)
-    _sync(out.parent)
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

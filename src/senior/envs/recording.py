@@ -15,8 +15,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from senior.envs.drawing import CLIP_SIDE, KEYFRAMES, Camera, Film, NoVideo, camera, own_fps, put
+from senior.envs.drawing import CLIP_SIDE, KEYFRAMES, Camera, Film, NoVideo, camera, own_fps
 from senior.envs.episodes import AFTERWARDS, Failure, Local, Step
+from senior.files import put
 from senior.types import BadInput, EnvSpec
 
 STEPS = 60

@@ -30,7 +30,7 @@ from senior.config import load, made_by
 from senior.envs.drawing import KEYFRAMES, Film, NoVideo
 from senior.envs.recording import film_of
 from senior.label.scenes import Segment, Stage, Unlike, film_fps, filmed
-from senior.preferences import connect, transaction
+from senior.preference_file import connect, has_tables, transaction
 from senior.types import BadInput
 
 try:
@@ -66,13 +66,11 @@ class Store:
         Raises `BadInput` if it cannot be read.
         """
         path = run / "preferences.sqlite"
-        while not (path.exists() and path.stat().st_size):
+        while not has_tables(path):
             time.sleep(PAUSE)
         self.folder = run / "label" / "clips"
         self.live = run / "label" / "live"
         self.db = connect(path)
-        while not self.db.execute("PRAGMA user_version").fetchone()[0]:
-            time.sleep(PAUSE)
         self.overlap = overlap
         self._seen = -1
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Literal, NamedTuple
 
-from senior.preferences import Asked, Rules, asked_of, connect, pairs_of, transaction
+from senior.preference_file import Asked, Rules, asked_of, connect, pairs_of, transaction
 from senior.types import Preferred
 
 LEASE_SECONDS = 120.0
@@ -218,12 +218,13 @@ class Desk:
             now = self._clock()
             leases = self._db.execute("SELECT pair, annotator, until FROM leases WHERE until > ?", (now,)).fetchall()
             own = {pair: until for pair, who, until in leases if who == annotator}
-            unfinished = [pair for pair in self._open() if not pair.complete(self.rules)]
+            asked = self._open()
+            unfinished = [pair for pair in asked if not pair.complete(self.rules)]
             mine = [pair for pair in unfinished if annotator not in (one.annotator for one in pair.said)]
             taken = {pair.id: sum(who != annotator for number, who, _ in leases if number == pair.id) for pair in mine}
             free = [pair for pair in mine if len(pair.said) + taken[pair.id] < self.rules.overlap]
             free.sort(key=lambda pair: -own.get(pair.id, 0.0))  # stable: the rest stays in the order of asking
-            shown = list(islice((told for pair in free if (told := self._shown(pair))), 1 + AHEAD))
+            shown = list(islice((told for pair in free if (told := self._shown(pair, asked))), 1 + AHEAD))
             if not shown:
                 return Assignment(None, [], "drawing" if free else "others" if unfinished else "waiting")
             if shown[0]["pair"] not in own:
@@ -232,16 +233,10 @@ class Desk:
 
     def _open(self) -> list[Asked]:
         """The pairs that are asked and not trained on."""
-        pairs = pairs_of(self._db, _OPEN)
-        sessions = dict.fromkeys(pair.session for pair in pairs)
-        return [
-            pair
-            for session in sessions
-            for pair in asked_of([one for one in pairs if one.session == session], self.rules)
-        ]
+        return asked_of(pairs_of(self._db, _OPEN), self.rules)
 
-    def _shown(self, pair: Asked) -> dict[str, Any] | None:
-        """A pair as a page shows it; None if its clips are not drawn yet."""
+    def _shown(self, pair: Asked, asked: Sequence[Asked]) -> dict[str, Any] | None:
+        """A pair, of those that are ``asked``, as a page shows it; None if its clips are not drawn yet."""
         clips = self._db.execute(
             "SELECT name, frames, fps, speed, failure FROM clips WHERE pair = ? ORDER BY side", (pair.id,)
         ).fetchall()
@@ -249,7 +244,7 @@ class Desk:
             return None
         failure = next((clip[4] for clip in clips if clip[0] is None), None)
         left, right = clips[pair.shown_left], clips[1 - pair.shown_left]
-        session = asked_of(pairs_of(self._db, "session = ?", pair.session), self.rules)
+        session = [one.id for one in asked if one.session == pair.session]
         return {
             "pair": pair.id,
             "left": None if failure else f"/clips/{left[0]}.mp4",
@@ -259,7 +254,7 @@ class Desk:
             "speed": left[3],
             "session": pair.session + 1,
             "step": pair.step,
-            "number": [one.id for one in session].index(pair.id) + 1,
+            "number": session.index(pair.id) + 1,
             "size": len(session),
             "note": failure,
         }

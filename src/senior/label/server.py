@@ -16,7 +16,7 @@ import secrets
 import socket
 import sys
 import time
-from contextlib import closing, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import uvicorn
@@ -27,7 +27,7 @@ from senior.label.desk import Desk
 from senior.label.guard import MOST_BYTES, Access, is_loopback
 from senior.label.serving import BAD_INPUT, SERVED, Address, Served
 from senior.label.standing import Standing
-from senior.preferences import Rules, connect
+from senior.preference_file import has_tables
 from senior.types import BadInput
 
 FIRST_PORT = 8642
@@ -37,9 +37,7 @@ PLAIN = re.compile(r"[A-Za-z0-9._~-]*")
 
 def standing_of(run: Path, config: Config) -> Standing:
     """What is served of a run."""
-    asking = config.asking
-    rules = Rules(asking.overlap, asking.replace_skipped, asking.soft_labels)
-    return Standing(run, config, Desk(run / "preferences.sqlite", rules))
+    return Standing(run, config, Desk(run / "preferences.sqlite", config.asking.rules))
 
 
 def access_to(address: Address, port: int, token: str) -> Access:
@@ -114,9 +112,9 @@ def _serve_alone(run: Path, config: Config, address: Address, owner: str) -> Ser
     before = Served.find(run)
     (folder / "server.json").unlink(missing_ok=True)  # of a server that is gone
     token = _token(folder, address.token)
-    if owner == "user" and not _has_tables(run / "preferences.sqlite"):
-        print("The run has not begun; the page is served when it does.", flush=True)
-    while not _has_tables(run / "preferences.sqlite"):
+    if owner == "user" and not has_tables(run / "preferences.sqlite"):
+        print("The run has not begun; the page is served when it does.", file=sys.stderr)
+    while not has_tables(run / "preferences.sqlite"):
         time.sleep(0.2)
     listening = _bind(address, before.port if before else None)
     port = listening.getsockname()[1]
@@ -135,14 +133,6 @@ def _serve_alone(run: Path, config: Config, address: Address, owner: str) -> Ser
     server = uvicorn.Server(serving)
     server.run(sockets=[listening])
     return served
-
-
-def _has_tables(path: Path) -> bool:
-    """Whether the trainer has made the preference file. Raises `BadInput` if it cannot be read."""
-    if not path.exists() or path.stat().st_size == 0:
-        return False
-    with closing(connect(path)) as db:
-        return db.execute("PRAGMA user_version").fetchone()[0] > 0
 
 
 def _shown_host(host: str) -> str:
