@@ -207,7 +207,7 @@ class Training:
         warn = partial(self.warn, i)
         if heard:
             session.learn(trainee, self.runs, i, step, warn)
-        elif plan.session and not trainee.waits:
+        elif plan.session and not trainee.session_open:
             refused = session.hold(trainee, self.runs, i, step, plan.session, warn, partial(self.pause, i, step))
             if refused:
                 self.fail(i, step, refused)
@@ -238,7 +238,7 @@ class Training:
     def heard(self, i: int, step: int) -> bool:
         """Whether a session that is not waited for has been answered by ``step``."""
         trainee = self.trainees[i]
-        if not trainee.waits:
+        if not trainee.session_open:
             return False
         refused = session.listen(trainee)
         if refused:

@@ -324,7 +324,7 @@ class Trainee:
         return found
 
     @property
-    def waits(self) -> bool:
+    def session_open(self) -> bool:
         """Whether a session was asked that is not yet learned from."""
         return self.progress.collected < self.progress.sessions
 

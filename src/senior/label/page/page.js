@@ -2,7 +2,7 @@
 
 import { connectKeys } from "./keys.js";
 import { createPlayer } from "./player.js";
-import { post, uuid, wait } from "./post.js";
+import { newId, post, wait } from "./post.js";
 
 const el = Object.fromEntries([...document.querySelectorAll("[id]")].map((element) => [element.id, element]));
 const ANSWER_BUTTONS = [...document.querySelectorAll("[data-answer]")];
@@ -118,7 +118,7 @@ async function act(path, fields, button) {
   tell("");
   showReadiness();
   const began = performance.now();
-  const reply = await send(path, { post: uuid(), annotator, ...fields }, "Not saved, trying again …");
+  const reply = await send(path, { post: newId(), annotator, ...fields }, "Not saved, trying again …");
   button.classList.remove("chosen");
   if (reply === null) return;
   saving = false;
