@@ -9,7 +9,8 @@ import pytest
 
 from senior import bench, bench_environments
 from senior.bench import PARTS, multiply_adds
-from senior.cli import DONE, main
+from senior.cli import main
+from senior.cli.options import DONE
 from senior.envs.episodes import Local
 from senior.program import make_learner
 from senior.together import Pools

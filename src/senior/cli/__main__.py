@@ -1,0 +1,5 @@
+import sys
+
+from senior.cli import main
+
+sys.exit(main())
