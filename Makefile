@@ -5,8 +5,8 @@ BIN := .venv/bin
 PIP := -m pip --quiet --quiet --disable-pip-version-check
 JOBS ?= 2
 PROOFS ?= $(sort $(wildcard tests/prove_*.py))
-LOCK_WITH := uv pip compile pyproject.toml --extra dev --extra label --universal --python-version 3.11 --fork-strategy fewest \
-	--only-binary :all: --generate-hashes --no-emit-index-url --no-emit-find-links
+LOCK_WITH := uv pip compile pyproject.toml --extra dev --extra label --extra ray --extra report --universal --python-version 3.11 --fork-strategy fewest \
+	--only-binary :all: --no-binary rliable --generate-hashes --no-emit-index-url --no-emit-find-links
 
 # Candidates are run, not only looked up: a version manager's stand-in can be on the path and refuse to start.
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 from senior.config import Answering, Config
@@ -68,6 +69,12 @@ def answering(config: Config) -> Answering:
             raise BadInput(f"--{next(iter(asked))} is a number of scripted teachers, and {config.teacher} is none.")
         return config.answering
     return Answering(**{**own._asdict(), **asked})
+
+
+def resolved(config: Config) -> Config:
+    """The configuration as ``config.json`` keeps it: the teacher's numbers filled in, a label file's path absolute."""
+    own = replace(config, answering=answering(config))
+    return replace(own, teacher=str(Path(own.teacher).resolve())) if is_recorded(own) else own
 
 
 def takes_time(config: Config) -> bool:

@@ -64,6 +64,7 @@ def train_all(
     workers: int | None = None,
     runs_per_device: int | None = None,
     page: Address = HERE,
+    go_on: bool = False,
 ) -> list[Result]:
     """Train runs of any configurations, each in its directory, on one device.
 
@@ -77,10 +78,11 @@ def train_all(
         but not more than runs, and 0 on a CPU.
     runs_per_device: how many are trained at a time; None: as many as the memory holds.
     page: where people, if they are the teacher, are asked; what each run's page is opened by is told to ``watcher``.
+    go_on: whether a run that is there already, begun with the same configuration, goes on from its newest checkpoint.
 
     Returns one `Result` per run, in order; where there are several, one that cannot be opened is told in its own.
     Raises `BadInput` before anything is written if a configuration makes no sense, an environment does not fit, or a
-    directory is not empty.
+    directory is not empty or, with ``go_on``, holds another run.
     """
     if not runs:
         raise BadInput("There is no run to train.")
@@ -101,24 +103,33 @@ def train_all(
     watcher = watcher or Quiet()
     device = prepare_device(runs[0][0].device)
     with Pools(workers, device, len(runs)) as pools:
-        trainees = []
+        begun, fresh = [], []
+        waiting: list[Waiting] = []
         for config, path in runs:
-            own = replace(config, device=device, answering=parts.answering(config))
-            if parts.is_recorded(own):  # the run may go on from another folder
-                own = replace(own, teacher=str(Path(own.teacher).resolve()))
+            own = replace(parts.resolved(config), device=device)
             spec = spec_of(own)
             _check_fit(own, spec)
             learner = make_learner(own, spec)
-            trainees.append(Trainee(own, path, learner, spec, pools.worker(learner)))
-        for trainee in trainees:
+            trainee = Trainee(own, path, learner, spec, pools.worker(learner))
+            if go_on and (path / "config.json").is_file():
+                begun.append(trainee)
+                waiting.append(Waiting(trainee, partial(trainee.resume, watcher.say)))
+            else:
+                fresh.append(trainee)
+                waiting.append(Waiting(trainee, trainee.begin))
+        for trainee in begun:
+            trainee.directory.check_holds(trainee.config)
+            with rundir.told(trainee.directory.path):
+                trainee.directory.lock()
+            _compare_protocol(trainee, device, watcher)
+        for trainee in fresh:
             trainee.directory.check_free()
             if not trainee.filmed:
                 trainee.reset(0)
-        for trainee in trainees:
+        for trainee in fresh:
             trainee.directory.create(trainee.config, rundir.protocol(trainee.spec, device))
             if trainee.filmed:  # into that directory
                 trainee.reset(0)
-        waiting = [Waiting(trainee, trainee.begin) for trainee in trainees]
         return train_waiting(waiting, watcher, lift, runs_per_device, len(runs) == 1, page)
 
 

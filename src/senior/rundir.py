@@ -1,7 +1,7 @@
 """A run's directory: its files, their columns, and how long each was at a checkpoint (README, "The run directory").
 
 CSV files are the truth; TensorBoard mirrors them. Nothing that depends on the clock is written outside
-``timing.csv`` (whose length checkpoints remember), ``tensorboard/`` and the time of an answer, so equal seeds give
+``timing.csv`` (whose length checkpoints remember), ``tensorboard/``, ``status.json`` and the time of an answer, so equal seeds give
 equal files.
 """
 
@@ -16,6 +16,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -24,7 +25,7 @@ from typing import Any
 import numpy as np
 from tensorboardX import SummaryWriter
 
-from senior.config import Config, to_json
+from senior.config import Config, differences, load, to_json
 from senior.envs import metaworld
 from senior.files import Damaged, pack, unpack, write_atomically
 from senior.types import BadInput, EnvSpec
@@ -128,6 +129,15 @@ class RunDirectory:
         except OSError:  # a file system without locks
             pass
 
+    def check_holds(self, config: Config) -> None:
+        """`BadInput` if the run that is there is another one. Where it is computed may differ."""
+        held = load(self.path / "config.json")
+        differing = differences(replace(held, device=config.device), config)
+        if differing:
+            name, there, here = differing[0]
+            others = f" and {len(differing) - 1} more differences" if len(differing) > 1 else ""
+            raise BadInput(f"{self.path} holds another run: its {name} is {there}, not {here}{others}.")
+
     def append(self, table: str, row: Mapping[str, Any]) -> None:
         """One row; numbers that are missing or None stay empty."""
         columns = TABLES[table]
@@ -153,7 +163,7 @@ class RunDirectory:
             file.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {sentence}\n")
 
     def tell(self, status: Mapping[str, Any]) -> None:
-        """What the run is doing now, for the labelling page. It need not outlive a crash of the machine."""
+        """What the run is doing now, for the labelling page and for sweeps. It need not outlive a crash of the machine."""
         new = self.path / "status.json.tmp"
         new.write_text(json.dumps(status))
         os.replace(new, self.path / "status.json")

@@ -82,7 +82,7 @@ class Trainee:
         self.rule = parts.selection(config) if config.method.learns_reward else None
         self.teacher = parts.teacher(config)
         self.rules = config.asking.rules
-        self._told: tuple[str, float, int] = ("", 0.0, 0)  # phase, time and step of what people were told last
+        self._told: tuple[str, float, int] = ("", 0.0, 0)  # phase, time and step of what was told last
         self.put: set[int] = set()  # pairs of the session under way that were put to the teacher
         self._preferences: Preferences | None = None
 
@@ -223,12 +223,10 @@ class Trainee:
         progress.written = checkpoint.save(self.directory.checkpoints, step, run, asdict(progress), progress.written)
 
     def tell(self, phase: str, step: int) -> None:
-        """Tell people, where they are the teacher, what the run is doing; twice a second at most.
+        """Tell whoever looks on from outside what the run is doing; twice a second at most.
 
         phase: starting, pretraining, training, waiting (for answers), evaluating, finished or stopped.
         """
-        if self.config.teacher != "human":
-            return
         now, (before, last, at) = time.time(), self._told
         if phase == before and now - last < 0.5:
             return
@@ -240,6 +238,8 @@ class Trainee:
                 "step": step,
                 "steps": self.config.steps,
                 "steps_per_second": rate,
+                "labels": self.progress.labels,
+                "success": self.progress.success,
                 "failure": self.failure,
                 "process": os.getpid(),
             }

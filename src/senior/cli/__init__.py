@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 
-from senior.cli import judge, lists, people, train
+from senior.cli import experiments, judge, lists, people, train
 from senior.cli.options import BAD_INPUT, DONE, FAILED, INTERRUPTED
 from senior.types import BadInput
 
@@ -13,6 +13,10 @@ COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
     "train": (train.train, "train one run, or several seeds in one program"),
     "resume": (train.resume, "continue an interrupted run, or all runs under a directory"),
     "eval": (judge.evaluate, "judge a run's policy on fresh episodes, and film it"),
+    "sweep": (experiments.sweep, "train every combination of options, on this machine or a Ray cluster"),
+    "reproduce": (experiments.reproduce, "train a paper's studies, and set its numbers beside ours"),
+    "report": (experiments.report, "put finished runs on one page, with curves and intervals"),
+    "watch": (experiments.watch, "serve that page, live, while runs are trained"),
     "label": (people.label, "serve the page on which people compare a run's clips"),
     "labels": (people.labels, "export, import, or look at what people said"),
     "tasks": (lists.tasks, "list the tasks"),

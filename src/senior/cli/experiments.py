@@ -1,0 +1,194 @@
+"""`senior sweep`, `senior reproduce`, `senior report` and `senior watch`: many runs, and what they show."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from senior.cli import grid
+from senior.cli.options import DONE, FAILED, INTERRUPTED, parse
+from senior.sweep.cells import Cell, check_cells, standing
+from senior.types import BadInput
+
+if TYPE_CHECKING:
+    from senior.sweep.board import Board
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """Train every combination of options, on this machine or on a Ray cluster.
+
+    Every option of senior train can be given several values: --method m-senior pebble --task door-lock window-open
+    --seed 0 1 2 makes twelve cells; an option that is given twice has the values of both. --arm takes methods with
+    options of their own, "m-senior --select disagreement". Each cell is a run in OUT/TASK/ARM/seed-N; finished ones are
+    skipped, interrupted ones go on.
+    """
+
+    out: Path
+    """Directory that takes the cells."""
+    file: Path | None = None
+    """A TOML file that holds the grid: a key per option, a value or a list of them. Options given beside it win."""
+    jobs: int | None = None
+    """Workers on this machine. Left out: one per processor on a CPU, one on a GPU."""
+    ray: str | None = None
+    """Address of a Ray cluster to train on, HOST:PORT or auto, instead of this machine. OUT must be a folder that all
+    its machines share."""
+    list: bool = False
+    """Only list the cells and where they stand."""
+
+
+def sweep(arguments: Sequence[str]) -> int:
+    names = [entry.name for entry in fields(SweepOptions)]
+    mine, given = grid.split(arguments, [*names, "help"])
+    if "-h" in arguments:
+        mine = ["--help"]
+    options = parse(SweepOptions, mine, None, "sweep")
+    axes = {**(grid.read(options.file) if options.file else {}), **given}
+    cells = grid.cells_of(axes, options.out)
+    check_cells(cells)
+    if options.list:
+        for cell in cells:
+            print(f"{cell}  {_stands(cell)}")
+        return DONE
+    return run_cells(cells, options.out, options.jobs, options.ray)
+
+
+def run_cells(cells: Sequence[Cell], out: Path, jobs: int | None, ray: str | None) -> int:
+    """Run a sweep under the eyes of a person; returns the exit code."""
+    from senior.sweep.board import Board
+    from senior.sweep.run import run
+
+    board = Board(out)
+    with _stopping(board), board:
+        done = run(cells, out, board, jobs, ray)
+    print(
+        f"{len(done.finished)} of {len(cells)} cells are finished"
+        + (f", {len(done.failed)} failed:" if done.failed else ".")
+    )
+    for cell, reason in done.failed.items():
+        print(f"  {cell}: {reason}")
+    if board.stop and len(done.finished) < len(cells):
+        print("Interrupted, all saved; the same command goes on.")
+        return INTERRUPTED
+    return FAILED if done.failed else DONE
+
+
+@contextmanager
+def _stopping(board: Board) -> Iterator[None]:
+    """The first SIGINT or SIGTERM stops the sweep, all saved; a second one ends the program at once."""
+
+    def asked(number: int, frame: FrameType | None) -> None:
+        if board.stop:
+            raise KeyboardInterrupt
+        board.stop = True
+
+    before = {number: signal.signal(number, asked) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _stands(cell: Cell) -> str:
+    told = standing(cell.path)
+    if told.get("phase") == "finished":
+        return "finished"
+    return f"step {told['step']:,}" if "step" in told else "not begun"
+
+
+@dataclass(frozen=True)
+class ReproduceOptions:
+    """Train what a paper trained, and set its numbers and sentences beside ours.
+
+    Finished runs are skipped and interrupted ones go on, so the same command goes on with a study, or with more seeds.
+    """
+
+    paper: tyro.conf.Positional[Literal["senior"]]
+    """Which paper: senior."""
+    table: tuple[Literal["main", "feedback", "ablation", "quality"], ...] = ("main",)
+    """Its studies: main (Fig. 4, Table I), feedback (Fig. 5), ablation (Fig. 6), quality (Fig. 7). What several of them
+    train is trained once."""
+    scale: Literal["paper", "quick", "smoke"] = "paper"
+    """paper: the paper's numbers. quick: the preset quick, for a CPU, for 100,000 steps. smoke: toy sizes."""
+    tasks: tuple[str, ...] = ()
+    """Only these of the paper's tasks. Left out: all."""
+    seeds: int | None = None
+    """How many seeds, from 0 on. Left out: 5, with --scale quick 8, with smoke 2."""
+    out: Path | None = None
+    """Directory that takes runs and report. Left out: runs/reproduce-senior-SCALE."""
+    jobs: int | None = None
+    """As in senior sweep."""
+    ray: str | None = None
+    """As in senior sweep."""
+    train: bool = True
+    """--no-train: only make the page of what is finished."""
+
+
+def reproduce(arguments: list[str]) -> int:
+    options = parse(ReproduceOptions, arguments, None, "reproduce")
+    from senior.reproduce import run
+    from senior.reproduce.studies import SEEDS
+
+    seeds = SEEDS[options.scale] if options.seeds is None else options.seeds
+    if seeds < 1:
+        raise BadInput(f"--seeds must be at least 1, not {seeds}.")
+    studies = run.studies_of(options.table, options.tasks or None)
+    out = options.out or Path("runs") / f"reproduce-{options.paper}-{options.scale}"
+    code = DONE
+    if options.train:
+        cells = run.cells(studies.values(), range(seeds), options.scale, out)
+        code = run_cells(cells, out, options.jobs, options.ray)
+    if code != INTERRUPTED:
+        built, summary = run.write(studies, options.scale, out)
+        print(f"{summary}\n{built.page}")
+    return code
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Put finished runs on one page: curves, intervals, comparisons, what the robot did and what was asked."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Run directories, or directories that hold some."""
+    out: Path
+    """Directory that takes index.html, figures/ and tables/."""
+
+
+def report(arguments: list[str]) -> int:
+    options = parse(ReportOptions, arguments, None, "report")
+    from senior.report.build import report
+
+    built = report(options.runs, options.out)
+    for path, reason in built.left_out:
+        print(f"left out: {path}: {reason}", file=sys.stderr)
+    print(f"{built.runs} runs: {built.page}")
+    return DONE
+
+
+@dataclass(frozen=True)
+class WatchOptions:
+    """Serve the page of senior report, live, while runs are trained."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Run directories, or directories that hold some, or will."""
+    host: str = "127.0.0.1"
+    """Address to listen on."""
+    port: int = 0
+    """0: a free one."""
+
+
+def watch(arguments: list[str]) -> int:
+    options = parse(WatchOptions, arguments, None, "watch")
+    from senior.report.watch import serve
+
+    serve(options.runs, options.host, options.port)
+    return DONE

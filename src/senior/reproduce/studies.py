@@ -1,0 +1,320 @@
+"""The studies of the SENIOR paper (Section V) as data: what is trained, what it reports, what it says.
+
+Its main table gives numbers, ``MAIN``. Its figures give none, so there its sentences are what can be tested,
+``CLAIMS``: in our words, with the place where the paper has them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+from senior.config import Config, Evaluation, Networks, Pretraining
+from senior.presets import preset, with_budget
+
+Scale = Literal["paper", "quick", "smoke"]
+Table = Literal["main", "feedback", "ablation", "quality"]
+
+TASKS = ("door-lock", "window-close", "handle-press", "window-open", "door-open", "door-unlock")
+BASELINES = ("pebble", "mrn", "rune", "m-rune", "qpa")
+BUDGETS = (150, 250, 500, 1000)
+
+MAIN: dict[str, tuple[tuple[int, int], ...]] = {
+    # success in percent at 500,000 and 1,000,000 steps, task by task as in TASKS
+    "pebble": ((60, 82), (60, 60), (36, 42), (20, 20), (58, 60), (56, 52)),
+    "mrn": ((41, 60), (62, 66), (66, 62), (52, 44), (24, 38), (54, 52)),
+    "rune": ((34, 54), (80, 80), (58, 58), (70, 60), (58, 60), (38, 48)),
+    "m-rune": ((60, 76), (80, 80), (76, 76), (62, 78), (26, 42), (48, 66)),
+    "qpa": ((76, 90), (20, 26), (56, 80), (40, 36), (48, 60), (30, 28)),
+    "p-senior": ((86, 92), (88, 98), (90, 94), (68, 68), (60, 80), (64, 84)),
+    "m-senior": ((92, 98), (100, 100), (98, 100), (88, 90), (72, 100), (76, 96)),
+}
+"""The paper's main table (Table I): five seeds, ten episodes each."""
+AVERAGES: dict[str, tuple[int, int]] = {
+    "pebble": (48, 53),
+    "mrn": (50, 54),
+    "rune": (56, 60),
+    "m-rune": (59, 70),
+    "qpa": (45, 53),
+    "p-senior": (76, 86),
+    "m-senior": (88, 97),
+}
+"""Its last column."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A method as a study trains it."""
+
+    name: str
+    """What it is called in the tables, and the name of its directory."""
+    method: str
+    select: str | None = None
+    explore: str | None = None
+    mix: str | None = None
+    teacher: str | None = None
+    budget: int | None = None
+    """None: the task's."""
+
+
+def _plain(*methods: str) -> tuple[Arm, ...]:
+    return tuple(Arm(name, name) for name in methods)
+
+
+def with_labels(method: str, budget: int) -> Arm:
+    """A method with another budget."""
+    return Arm(f"{method}-{budget}", method, budget=budget)
+
+
+WITHOUT_PGE = Arm("m-senior-without-pge", "m-senior", explore="none", mix="uniform")
+WITHOUT_MDS = Arm("m-senior-without-mds", "m-senior", select="disagreement")
+NOISY, FILTERED = "mistake", "skip"
+
+
+@dataclass(frozen=True)
+class Study:
+    """One of the paper's tables or figures."""
+
+    title: str
+    where: str
+    tasks: tuple[str, ...]
+    arms: tuple[Arm, ...]
+
+
+STUDIES: dict[str, Study] = {
+    "main": Study(
+        "Success on six tasks", "Fig. 4 and Table I", TASKS, _plain("sac", *BASELINES, "p-senior", "m-senior")
+    ),
+    "feedback": Study(
+        "Success by feedback budget",
+        "Fig. 5",
+        ("door-lock", "window-open"),
+        tuple(with_labels(method, budget) for budget in BUDGETS for method in (*BASELINES, "p-senior", "m-senior")),
+    ),
+    "ablation": Study(
+        "Without MDS, without PGE", "Fig. 6", TASKS, (*_plain("mrn", "m-senior"), WITHOUT_PGE, WITHOUT_MDS)
+    ),
+    "quality": Study(
+        "Wrong and filtered answers",
+        "Fig. 7",
+        ("door-lock", "handle-press"),
+        (
+            WITHOUT_PGE,  # what that figure calls MDS
+            replace(WITHOUT_PGE, name="mds-fn", teacher=NOISY),
+            replace(WITHOUT_PGE, name="mds-ff", teacher=FILTERED),
+            *_plain("qpa"),
+            Arm("qpa-fn", "qpa", teacher=NOISY),
+            Arm("qpa-ff", "qpa", teacher=FILTERED),
+        ),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """The success of an arm, averaged over tasks: at half of the steps, at the end, or over the whole curve."""
+
+    arm: str
+    tasks: tuple[str, ...]
+    when: Literal["half", "end", "curve"] = "end"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """That one quantity is higher than another, or than a number, by more than a margin (negative: hardly lower)."""
+
+    higher: Quantity
+    lower: Quantity | float
+    margin: float = 0.0
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A sentence of the paper, and what would confirm or refute it: all of its comparisons."""
+
+    table: Table
+    sentence: str
+    where: str
+    comparisons: tuple[Comparison, ...]
+
+
+def _above(arm: str, others: tuple[str, ...], tasks: tuple[str, ...], when: Literal["half", "end", "curve"] = "end"):
+    """On every task by itself."""
+    return tuple(
+        Comparison(Quantity(arm, (task,), when), Quantity(other, (task,), when)) for task in tasks for other in others
+    )
+
+
+FOUR_TIMES = tuple(
+    # 250 answers, and others with a thousand are not more than ten points ahead
+    Comparison(Quantity("m-senior-250", (task,)), Quantity(f"{other}-1000", (task,)), -0.1)
+    for task in ("door-lock", "window-open")
+    for other in BASELINES
+)
+
+CLAIMS: tuple[Claim, ...] = (
+    Claim(
+        "main",
+        "On every task P-SENIOR and M-SENIOR end with more success than the five other methods.",
+        "V.C, Fig. 4",
+        _above("m-senior", BASELINES, TASKS) + _above("p-senior", BASELINES, TASKS),
+    ),
+    Claim(
+        "main",
+        "On every task they converge faster: there is more success below their whole curves.",
+        "V.C, Fig. 4",
+        _above("m-senior", BASELINES, TASKS, "curve") + _above("p-senior", BASELINES, TASKS, "curve"),
+    ),
+    Claim(
+        "main",
+        "On average M-SENIOR has more success after half of the steps than any other method at the end.",
+        "V.C",
+        tuple(Comparison(Quantity("m-senior", TASKS, "half"), Quantity(other, TASKS)) for other in BASELINES),
+    ),
+    Claim(
+        "main",
+        "On Door Open M-SENIOR ends 40 points above the five other methods.",
+        "V.C; tested with 10 points less",
+        tuple(
+            Comparison(Quantity("m-senior", ("door-open",)), Quantity(other, ("door-open",)), 0.3)
+            for other in BASELINES
+        ),
+    ),
+    Claim(
+        "main",
+        "P-SENIOR ends 33 points above PEBBLE on average.",
+        "V.C; tested with 10 points less",
+        (Comparison(Quantity("p-senior", TASKS), Quantity("pebble", TASKS), 0.23),),
+    ),
+    Claim(
+        "main",
+        "On Window Open P-SENIOR ends below M-RUNE.",
+        "V.C",
+        (Comparison(Quantity("m-rune", ("window-open",)), Quantity("p-senior", ("window-open",))),),
+    ),
+    Claim(
+        "feedback",
+        "With every budget M-SENIOR has the highest success.",
+        "V.C, Fig. 5",
+        tuple(
+            Comparison(Quantity(f"m-senior-{budget}", (task,)), Quantity(f"{other}-{budget}", (task,)))
+            for task in ("door-lock", "window-open")
+            for budget in BUDGETS
+            for other in BASELINES
+        ),
+    ),
+    Claim(
+        "feedback",
+        "It is at least four times as feedback-efficient: with 250 answers it does as well as others with 1,000.",
+        "V.C; as well: not more than 10 points lower",
+        FOUR_TIMES,
+    ),
+    Claim(
+        "feedback",
+        "M-SENIOR reaches nearly 100 % on Door Lock with 250 answers.",
+        "V.C; nearly: above 90 %",
+        (Comparison(Quantity("m-senior-250", ("door-lock",)), 0.9),),
+    ),
+    Claim(
+        "feedback",
+        "M-SENIOR gets better with every larger budget.",
+        "V.C",
+        tuple(
+            Comparison(Quantity(f"m-senior-{more}", (task,)), Quantity(f"m-senior-{less}", (task,)))
+            for task in ("door-lock", "window-open")
+            for less, more in pairwise(BUDGETS)
+        ),
+    ),
+    Claim(
+        "ablation",
+        "Without PGE, and without MDS, it still does better than MRN.",
+        "V.D, Fig. 6",
+        _above(WITHOUT_PGE.name, ("mrn",), TASKS) + _above(WITHOUT_MDS.name, ("mrn",), TASKS),
+    ),
+    Claim(
+        "ablation",
+        "Both together learn the fastest.",
+        "V.D, Fig. 6",
+        _above("m-senior", (WITHOUT_PGE.name, WITHOUT_MDS.name), TASKS, "curve"),
+    ),
+    Claim(
+        "ablation",
+        "On Door Lock it is MDS that matters more, on Handle Press PGE.",
+        "V.D",
+        _above(WITHOUT_PGE.name, (WITHOUT_MDS.name,), ("door-lock",), "curve")
+        + _above(WITHOUT_MDS.name, (WITHOUT_PGE.name,), ("handle-press",), "curve"),
+    ),
+    Claim(
+        "quality",
+        "A tenth of wrong answers makes both MDS and QPA much worse.",
+        "V.D, Fig. 7",
+        _above(WITHOUT_PGE.name, ("mds-fn",), ("door-lock", "handle-press"))
+        + _above("qpa", ("qpa-fn",), ("door-lock", "handle-press")),
+    ),
+    Claim(
+        "quality",
+        "Leaving queries of low return out makes MDS worse on both tasks.",
+        "V.D, Fig. 7 (the text says MDS-FN twice; the second must be MDS-FF)",
+        _above(WITHOUT_PGE.name, ("mds-ff",), ("door-lock", "handle-press")),
+    ),
+    Claim(
+        "quality",
+        "Leaving them out makes QPA better on Handle Press.",
+        "V.D, Fig. 7 (as above)",
+        _above("qpa-ff", ("qpa",), ("handle-press",)),
+    ),
+)
+
+SEEDS: dict[str, int] = {"paper": 5, "quick": 8, "smoke": 2}
+"""How many seeds, from 0 on, where it is not said."""
+
+
+def configuration(arm: Arm, task: str, seed: int, scale: Scale) -> Config:
+    """What a study trains.
+
+    paper: with the paper's numbers. quick: with those of the preset ``quick``, for 100,000 steps. smoke: in a size that
+    shows that everything works, and nothing else.
+    """
+    config = preset("quick" if scale != "paper" else "paper", task, arm.method)
+    if arm.budget is not None and config.method.learns_reward:
+        config = with_budget(config, arm.budget)
+    method = config.method
+    cells = {name: getattr(arm, name) or getattr(method, name) for name in ("select", "explore", "mix")}
+    config = replace(config, seed=seed, method=replace(method, **cells), teacher=arm.teacher or config.teacher)
+    if scale == "quick":
+        return replace(config, steps=100_000)
+    return _smoke(config) if scale == "smoke" else config
+
+
+def _smoke(config: Config) -> Config:
+    """Episodes of 100 steps, networks of 16 units, three sessions."""
+    share = config.queries.budget / 250  # budgets stay different
+    config = replace(
+        config,
+        steps=800,
+        horizon=100,
+        networks=Networks(layers=1, width=16, reward_layers=1, reward_width=16),
+        sac=replace(config.sac, batch=32, updates=1, reset_updates=10),
+        reward=replace(config.reward, epochs=5, batch=16),
+        bilevel=replace(config.bilevel, every=200),
+        pge=replace(config.pge, capacity=100, every=100),
+        evaluation=Evaluation(every=200, episodes=2),
+        checkpoint_every=400,
+        snapshot_every=200,
+    )
+    if not config.method.learns_reward:
+        return replace(config, pretraining=Pretraining(random_steps=100, until=0))
+    return replace(
+        config,
+        pretraining=Pretraining(random_steps=100, until=300),
+        queries=replace(
+            config.queries, budget=max(3, round(12 * share)), per_session=max(1, round(4 * share)), every=100
+        ),
+    )
+
+
+def chosen(table: Table, tasks: tuple[str, ...] | None) -> Study:
+    """A study, on those of its tasks that are among ``tasks``."""
+    study = STUDIES[table]
+    return replace(study, tasks=tuple(task for task in study.tasks if tasks is None or task in tasks))

@@ -1,0 +1,113 @@
+"""The cells of a sweep, and what became of them."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from senior import parts
+from senior.checks import check
+from senior.config import Config, from_json, to_json
+from senior.rundir import RunDirectory
+from senior.types import BadInput
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of a sweep: its configuration and its directory."""
+
+    config: Config
+    path: Path
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+
+Job = tuple[Cell, ...]
+"""Cells that one worker is given at a time."""
+
+
+class Outcome(NamedTuple):
+    """What became of a cell."""
+
+    path: str
+    step: int
+    finished: bool
+    failure: str | None
+    """Why it was stopped; None: it finished, or was told to stop."""
+
+
+class Done(NamedTuple):
+    """A job that a worker is through with."""
+
+    job: Job
+    outcomes: tuple[Outcome, ...]
+    """In the order of the job's cells; empty if the worker was lost."""
+    reason: str = ""
+    """Why it was lost."""
+
+
+def check_cells(cells: Sequence[Cell]) -> None:
+    """Refuse, before anything runs, cells that make no sense or whose directories hold something else."""
+    if not cells:
+        raise BadInput("There is no cell in the sweep.")
+    paths = [cell.path.resolve() for cell in cells]
+    if len(set(paths)) < len(paths):
+        twice = next(path for path in paths if paths.count(path) > 1)
+        raise BadInput(f"Two cells of the sweep would be in {twice}.")
+    if len({cell.config.device for cell in cells}) > 1:
+        raise BadInput("All cells of a sweep are on one kind of device, so their --device must be the same.")
+    for cell in cells:
+        check(cell.config)
+        if parts.takes_time(cell.config):
+            raise BadInput(f"A sweep does not wait for people; the teacher of {cell} is {cell.config.teacher}.")
+        directory = RunDirectory(cell.path)
+        if (cell.path / "config.json").is_file():
+            directory.check_holds(parts.resolved(cell.config))
+        else:
+            parts.resolved(cell.config)
+            directory.check_free()
+
+
+def standing(path: Path) -> dict[str, Any]:
+    """What a run says that it is doing: phase, step, labels, success and so on; empty if nothing can be read."""
+    try:
+        told = json.loads((path / "status.json").read_text())
+    except (OSError, ValueError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
+def is_finished(path: Path) -> bool:
+    """Whether a run says that it is finished. One that is and does not say so is found out when it is opened."""
+    return standing(path).get("phase") == "finished"
+
+
+def saved_step(path: Path) -> int:
+    """The step of a run's newest checkpoint; -1: there is none."""
+    found = (re.fullmatch(r"step-(\d+)\.npz", file.name) for file in (path / "checkpoints").glob("step-*.npz"))
+    return max((int(match[1]) for match in found if match), default=-1)
+
+
+def order(job: Job) -> str:
+    """A job as a line of JSON, for a worker."""
+    return json.dumps([{"path": str(cell.path.resolve()), "config": to_json(cell.config)} for cell in job])
+
+
+def job_of(order: str) -> Job:
+    """The job that an `order` was made of."""
+    return tuple(Cell(from_json(cell["config"]), Path(cell["path"])) for cell in json.loads(order))
+
+
+def report(outcomes: Sequence[Outcome]) -> str:
+    """Outcomes as a line of JSON."""
+    return json.dumps(outcomes)
+
+
+def outcomes_of(report: str) -> tuple[Outcome, ...]:
+    """The outcomes that a `report` was made of."""
+    return tuple(Outcome(*fields) for fields in json.loads(report))

@@ -1,0 +1,148 @@
+"""Workers on this machine: processes of their own, each with its share of the processors."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from senior.rundir import threads
+from senior.sweep.cells import Done, Job, order, outcomes_of
+from senior.types import BadInput
+
+LEAVE_SECONDS = 120.0
+"""How long a worker that was told to stop may take to save what it does."""
+
+
+@dataclass
+class _Worker:
+    process: subprocess.Popen[bytes]
+    orders: int
+    answers: int
+    log: Path
+    job: Job | None = None
+    heard: bytes = b""
+
+
+class LocalCrew:
+    """So many workers at a time. One that dies is replaced when there is work for it."""
+
+    def __init__(self, device: str, jobs: int | None, logs: Path) -> None:
+        """device: auto, cpu or gpu. jobs: workers; None: one per processor on a CPU, one on a GPU.
+
+        Raises `BadInput` if there is no such device.
+        """
+        if jobs is not None and not 1 <= jobs <= 1024:
+            raise BadInput(f"--jobs {jobs} must be between 1 and 1024.")
+        self.device = find_device(device)
+        self.size = jobs or (1 if self.device == "gpu" else threads())
+        self._threads = max(1, threads() // self.size)
+        self._logs = logs
+        self._workers: list[_Worker] = []
+        logs.mkdir(parents=True, exist_ok=True)
+
+    @property
+    def idle(self) -> int:
+        """How many more jobs can be given."""
+        return self.size - sum(worker.job is not None for worker in self._workers)
+
+    def give(self, job: Job) -> None:
+        """Have a job done."""
+        worker = next((worker for worker in self._workers if worker.job is None), None) or self._start()
+        worker.job = job
+        with contextlib.suppress(BrokenPipeError):  # it died idle; `wait` finds out
+            os.write(worker.orders, f"{order(job)}\n".encode())
+
+    def wait(self, seconds: float) -> list[Done]:
+        """The jobs that are done, after at most so long."""
+        busy = [worker for worker in self._workers if worker.job is not None]
+        done = []
+        with selectors.DefaultSelector() as selector:
+            for worker in busy:
+                selector.register(worker.answers, selectors.EVENT_READ, worker)
+            for key, _ in selector.select(seconds):
+                done += self._hear(key.data)
+        return done
+
+    def stop(self) -> None:
+        """Tell all workers to save what they do and leave."""
+        for worker in self._workers:
+            if worker.process.poll() is None:
+                worker.process.send_signal(signal.SIGTERM)
+
+    def close(self) -> None:
+        """End all workers, everything saved."""
+        self.stop()
+        for worker in self._workers:
+            try:
+                worker.process.wait(LEAVE_SECONDS)
+            except subprocess.TimeoutExpired:
+                worker.process.kill()
+            self._bury(worker)
+        self._workers = []
+
+    def _start(self) -> _Worker:
+        taken = {worker.log for worker in self._workers}
+        names = (self._logs / f"worker-{i}.log" for i in range(self.size + 1))
+        log = next(name for name in names if name not in taken)
+        orders, give = os.pipe()
+        hear, answers = os.pipe()
+        command = [sys.executable, "-m", "senior.sweep.worker", str(orders), str(answers), str(self._threads)]
+        with open(log, "a") as file:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=file,
+                pass_fds=(orders, answers),
+                start_new_session=True,  # an interrupt at the keyboard is the sweep's, which then stops its workers
+            )
+        os.close(orders)
+        os.close(answers)
+        worker = _Worker(process, give, hear, log)
+        self._workers.append(worker)
+        return worker
+
+    def _hear(self, worker: _Worker) -> list[Done]:
+        told = os.read(worker.answers, 1 << 16)
+        worker.heard += told
+        job = worker.job
+        assert job is not None
+        if worker.heard.endswith(b"\n"):
+            outcomes, worker.heard, worker.job = outcomes_of(worker.heard.decode()), b"", None
+            return [Done(job, outcomes)]
+        if told:
+            return []
+        code = worker.process.wait()
+        self._workers.remove(worker)
+        self._bury(worker)
+        return [Done(job, (), _why(code, worker.log))]
+
+    def _bury(self, worker: _Worker) -> None:
+        worker.process.wait()
+        os.close(worker.orders)
+        os.close(worker.answers)
+
+
+def _why(code: int, log: Path) -> str:
+    if code < 0:
+        return f"its process was killed (signal {-code})"
+    said = log.read_text(errors="replace").strip().splitlines()
+    return f"its process ended with code {code}: {said[-1] if said else 'it said nothing'} ({log})"
+
+
+def find_device(device: str) -> str:
+    """cpu or gpu; asked in a process of its own, so that this one never holds a GPU's memory."""
+    if device == "cpu":
+        return device
+    program = "import sys\nfrom senior.runs import prepare_device\nfrom senior.types import BadInput\n"
+    program += f"try:\n    print(prepare_device({device!r}))\nexcept BadInput as error:\n    sys.exit(str(error))\n"
+    asked = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    if asked.returncode:
+        raise BadInput((asked.stderr.strip().splitlines() or ["The device cannot be found out."])[-1])
+    return asked.stdout.strip()

@@ -1,0 +1,67 @@
+"""A sweep from beginning to end: one at a time in a directory, with the workers it is given."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from senior.rundir import told
+from senior.sweep.cells import Cell, check_cells
+from senior.sweep.local import LocalCrew
+from senior.sweep.scheduler import Spectator, Sweep
+from senior.types import BadInput
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+
+def run(
+    cells: Sequence[Cell], out: Path, spectator: Spectator, jobs: int | None = None, ray: str | None = None
+) -> Sweep:
+    """Train all cells that are not finished; returns where each stands.
+
+    out: directory of the sweep, for its logs and its lock. jobs: workers on this machine; None: what suits it.
+    ray: the address of a Ray cluster to use instead. Raises `BadInput` before anything runs if a cell makes no sense,
+    a directory holds another run, or another sweep is at work in ``out``.
+    """
+    check_cells(cells)
+    sweep = Sweep(cells)
+    if not sweep.waiting:
+        return sweep
+    with told(out):
+        out.mkdir(parents=True, exist_ok=True)
+    with _alone(out):
+        if ray is not None:
+            from senior.sweep.cluster import RayCrew
+
+            crew = RayCrew(ray, cells[0].config.device, jobs, out)
+        else:
+            crew = LocalCrew(cells[0].config.device, jobs, out / "logs")
+        with closing(crew):
+            sweep.run(crew, spectator)
+    return sweep
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Keep other sweeps out of a directory; the lock goes with the process."""
+    if fcntl is None:
+        yield
+        return
+    with told(out):
+        lock = os.open(out, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(lock)
+        raise BadInput(f"Another sweep is at work in {out}.") from None
+    except OSError:  # a file system without locks
+        pass
+    try:
+        yield
+    finally:
+        os.close(lock)
