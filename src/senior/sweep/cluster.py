@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import platform
+import socket
 import time
 import uuid
 from pathlib import Path
@@ -22,6 +23,9 @@ from senior.types import BadInput
 
 LEAVE_SECONDS = 120.0
 """How long actors that were told to stop may take to save what they do."""
+
+
+CONNECT_SECONDS = 10.0
 
 
 class Hand:
@@ -131,6 +135,7 @@ def _connect(address: str) -> Any:
     if os.environ.get("RAY_AUTH_MODE", "token") != "token":
         raise BadInput("A sweep uses a Ray cluster only with a token: leave RAY_AUTH_MODE out, or set it to token.")
     os.environ["RAY_AUTH_MODE"] = "token"
+    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "error")  # else its retries fill the terminal
     try:
         import ray
     except ImportError:
@@ -138,9 +143,22 @@ def _connect(address: str) -> Any:
     kept = Path(os.environ.get("RAY_AUTH_TOKEN_PATH", Path.home() / ".ray" / "auth_token"))
     if not os.environ.get("RAY_AUTH_TOKEN") and not kept.is_file():
         raise BadInput(f"The Ray cluster's token is neither in RAY_AUTH_TOKEN nor in {kept}.")
+    _reach(address)
     try:
         name = f"senior-{uuid.uuid4().hex}"
         ray.init(address=address, namespace=name, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:  # whatever Ray raises: unreachable, wrong token, another version
-        raise BadInput(f"The Ray cluster at {address} cannot be used: {str(error).strip().splitlines()[0]}") from error
+        reason = str(error).strip().splitlines()[0]
+        raise BadInput(f"The Ray cluster at {address} cannot be used, or has another token: {reason}") from error
     return ray
+
+
+def _reach(address: str) -> None:
+    """`BadInput` if nothing listens there; Ray itself would try for many minutes."""
+    host, _, port = address.rpartition(":")
+    if not host:  # a name that Ray resolves: auto, local
+        return
+    try:
+        socket.create_connection((host, int(port)), CONNECT_SECONDS).close()
+    except (OSError, ValueError) as error:
+        raise BadInput(f"No Ray cluster answers at {address}: {error}.") from error
