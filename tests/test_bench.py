@@ -10,7 +10,7 @@ import pytest
 from senior import bench, bench_environments
 from senior.bench import PARTS, multiply_adds
 from senior.cli import main
-from senior.cli.options import DONE
+from senior.cli.shared import DONE
 from senior.envs.episodes import Local
 from senior.program import make_learner
 from senior.together import Pools

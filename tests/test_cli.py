@@ -14,7 +14,7 @@ import pytest
 
 from senior import envs, judgement, program
 from senior.cli import COMMANDS, main
-from senior.cli.options import BAD_INPUT, DONE, FAILED
+from senior.cli.shared import BAD_INPUT, DONE, FAILED
 from senior.config import Answering, Config, to_json
 from senior.label.serving import Address
 from senior.methods import METHODS

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from senior.cli import main
-from senior.cli.options import BAD_INPUT, DONE
+from senior.cli.shared import BAD_INPUT, DONE
 from tests.cluster import Cluster, two_nodes
 from tests.equal import OPTIONS, assert_same_run
 from tests.test_sweep import worker_of

@@ -19,12 +19,12 @@ import pytest
 from rich.console import Console
 
 from senior.cli import main
-from senior.cli.grid import cells_of, read, split
-from senior.cli.options import BAD_INPUT, DONE, INTERRUPTED
+from senior.cli.shared import BAD_INPUT, DONE, INTERRUPTED
 from senior.envs.point import Point
 from senior.rundir import threads
 from senior.sweep.board import Board
 from senior.sweep.cells import Cell, Done, Job, Outcome, check_cells, is_finished, job_of, order, outcomes_of, report
+from senior.sweep.grid import cells_of, read, split
 from senior.sweep.run import run
 from senior.sweep.scheduler import RETRIES, Sweep
 from senior.types import BadInput

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from senior.cli import experiments, judge, lists, people, train
-from senior.cli.options import BAD_INPUT, DONE, FAILED, INTERRUPTED
+from senior.cli.shared import BAD_INPUT, DONE, FAILED, INTERRUPTED
 from senior.types import BadInput
 
 COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {

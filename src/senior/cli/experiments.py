@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from senior.cli import grid
-from senior.cli.options import DONE, FAILED, INTERRUPTED, parse
+from senior.cli.shared import DONE, FAILED, INTERRUPTED
+from senior.options import parse
+from senior.sweep import grid
 from senior.sweep.cells import Cell, check_cells, standing
 from senior.types import BadInput
 

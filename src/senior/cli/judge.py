@@ -8,7 +8,8 @@ from typing import Literal
 
 import tyro
 
-from senior.cli.options import DONE, parse
+from senior.cli.shared import DONE
+from senior.options import parse
 from senior.types import BadInput
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from senior.cli.display import table
-from senior.cli.options import DONE, NoOptions, parse
+from senior.cli.shared import DONE, NoOptions
+from senior.options import parse
 from senior.presets import preset
 
 

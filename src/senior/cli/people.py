@@ -11,8 +11,9 @@ from typing import Annotated
 
 import tyro
 
-from senior.cli.options import DONE, PageOptions, parse
+from senior.cli.shared import DONE, PageOptions
 from senior.label.serving import check_installed
+from senior.options import parse
 from senior.types import BadInput
 
 

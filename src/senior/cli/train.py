@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import Annotated, Any
 import tyro
 
 from senior.cli.display import Display
-from senior.cli.options import DONE, FAILED, INTERRUPTED, Machine, PageOptions, parse
+from senior.cli.shared import DONE, FAILED, INTERRUPTED, Machine, PageOptions
 from senior.config import Config
-from senior.presets import preset, quick_changes, release, with_budget
-from senior.types import BadInput
+from senior.options import parse, starting_from
+from senior.presets import quick_changes
 
 
 @dataclass(frozen=True)
@@ -38,24 +37,6 @@ class ResumeOptions:
     """A run directory, or one that holds some."""
     machine: Annotated[Machine, tyro.conf.arg(name="")] = field(default_factory=Machine)
     page: Annotated[PageOptions, tyro.conf.arg(name="")] = field(default_factory=PageOptions)
-
-
-def starting_from(arguments: list[str]) -> Config:
-    """The configuration that options change: that of the task, method, preset, budget and compat among them."""
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    starts = {"task": "door-lock", "method": "m-senior", "preset": "paper", "env": None, "compat": "none"}
-    for name, default in starts.items():
-        first.add_argument(f"--{name}", default=default)
-    first.add_argument("--budget", type=int)
-    try:
-        known, _ = first.parse_known_args(arguments)
-    except argparse.ArgumentError as error:
-        needs = "a whole number" if "invalid int" in str(error) else "a value"
-        raise BadInput(f"{error.argument_name} needs {needs}.") from error
-    start = preset(known.preset, known.task, known.method)
-    if known.budget is not None:
-        start = with_budget(start, known.budget)
-    return release(start) if known.compat == "release" else start
 
 
 def train(arguments: list[str]) -> int:

@@ -15,6 +15,7 @@ width where all runs say the same.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
@@ -168,48 +169,40 @@ def improvement(scores: Mapping[str, Scores]) -> dict[tuple[str, str], Interval]
     for pair, estimate in zip(pairs, found.values(), strict=True):
         mean, low, high = (float(bound[0]) for bound in estimate)
         both[pair] = Interval(mean, low, high)
-        both[pair[::-1]] = Interval(1 - mean, 1 - high, 1 - low)
+        both[pair[1], pair[0]] = Interval(1 - mean, 1 - high, 1 - low)
     return both
 
 
 def profiles(scores: Mapping[str, Scores], thresholds: np.ndarray) -> dict[str, Intervals]:
     """Per method, the share of runs that score more than each threshold ``[points]``, every task weighing the same."""
 
-    def above(*blocks: np.ndarray) -> np.ndarray:
-        return _mean(*((block[..., None] > thresholds) for block in blocks))
+    def above(blocks: Blocks) -> np.ndarray:
+        return _mean([block[:, :, None] > thresholds[:, None] for block in blocks])
 
-    return _estimates({name: (own,) for name, own in scores.items()}, lambda own: above(*own))
+    return _estimates({name: (own,) for name, own in scores.items()}, above)
 
 
-# A block is ``[runs, tasks, ...]``: tasks of equally many runs. That is how rliable takes scores; it resamples runs
-# task by task.
+# A block is ``[runs, tasks, ..., g]``: tasks of equally many runs, and g groups of equal shape side by side. rliable
+# resamples runs task by task, point by point and group by group, so groups do not touch each other.
 Blocks = Sequence[np.ndarray]
 
 
-def _blocks(groups: Sequence[Scores]) -> list[Blocks]:
-    """Every method's scores as blocks, of the same tasks for all methods."""
-    uniform = all(len({len(task) for task in scores}) == 1 for scores in groups)
-    if uniform:
-        return [[np.stack([np.asarray(task, float) for task in scores], axis=1)] for scores in groups]
-    return [[np.asarray(task, float)[:, None] for task in scores] for scores in groups]
-
-
 def _interquartile(blocks: Blocks) -> np.ndarray:
-    return np.atleast_1d(interquartile_mean(np.concatenate([block.reshape(-1, *block.shape[2:]) for block in blocks])))
+    return interquartile_mean(np.concatenate([block.reshape(-1, *block.shape[2:]) for block in blocks]))
 
 
 def _mean(blocks: Blocks) -> np.ndarray:
     tasks = sum(block.shape[1] for block in blocks)
-    return np.atleast_1d(sum(block.mean(axis=0).sum(axis=0) for block in blocks) / tasks)
+    return np.sum([block.mean(axis=0).sum(axis=0) for block in blocks], axis=0) / tasks
 
 
 def _improvement(one: Blocks, other: Blocks) -> np.ndarray:
-    tasks, total = 0, 0.0
+    tasks = sum(block.shape[1] for block in one)
+    shares = []
     for x, y in zip(one, other, strict=True):
-        wins = (x[:, None] > y[None]) + 0.5 * (x[:, None] == y[None])  # [runs, runs, tasks]
-        tasks += x.shape[1]
-        total += float(wins.sum()) / (len(x) * len(y))
-    return np.array([total / tasks])
+        x, y = x[:, None], y[None]  # [runs, runs, tasks, g]
+        shares.append((np.mean(x > y, axis=(0, 1)) + np.mean(x == y, axis=(0, 1)) / 2).sum(axis=0))
+    return np.sum(shares, axis=0) / tasks
 
 
 def _estimates(groups: Mapping[str, Sequence[Scores]], statistic: Callable[..., np.ndarray]) -> dict[str, Intervals]:
@@ -217,33 +210,46 @@ def _estimates(groups: Mapping[str, Sequence[Scores]], statistic: Callable[..., 
 
     The interval is NaN where some task has one run of some method: to draw it again and again would show no spread.
     """
+    alike: dict[Any, list[str]] = defaultdict(list)
+    blocks = {name: _blocks(group) for name, group in groups.items()}
+    for name, own in blocks.items():
+        alike[tuple(tuple(block.shape for block in method) for method in own)].append(name)
     found = {}
-    for name, group in groups.items():
-        blocks = _blocks(group)
-        mean = statistic(*blocks)
-        if min(len(task) for scores in group for task in scores) < 2:
-            unknown = np.full(mean.shape, np.nan)
-            found[name] = Intervals(mean, unknown, unknown)
-            continue
-        low, high = _bootstrap(blocks, statistic)
-        found[name] = Intervals(mean, low, high)
-    return found
+    for names in alike.values():
+        together = [
+            [np.stack(same, axis=-1) for same in zip(*methods, strict=True)]
+            for methods in zip(*(blocks[name] for name in names), strict=True)
+        ]
+        bounds = statistic(*together), *_bootstrap(together, statistic)
+        for place, name in enumerate(names):
+            found[name] = Intervals(*(np.atleast_1d(bound[..., place]) for bound in bounds))
+    return {name: found[name] for name in groups}
 
 
-def _bootstrap(blocks: Sequence[Blocks], statistic: Callable[..., np.ndarray]) -> np.ndarray:
-    """Bounds ``[2, points]``."""
-    ends = np.cumsum([len(own) for own in blocks])[:-1]
+def _blocks(group: Sequence[Scores]) -> list[Blocks]:
+    """Every method's scores as blocks ``[runs, tasks, ...]``, of the same tasks for all methods."""
+    scores = [[np.asarray(task, float) for task in own] for own in group]
+    if all(len({len(task) for task in own}) == 1 for own in scores):
+        return [[np.stack(own, axis=1)] for own in scores]
+    return [[task[:, None] for task in own] for own in scores]
+
+
+def _bootstrap(together: Sequence[Blocks], statistic: Callable[..., np.ndarray]) -> np.ndarray:
+    """Bounds ``[2, ..., g]``."""
+    shape = statistic(*together).shape
+    flat = [block for method in together for block in method]
+    if min(len(block) for block in flat) < 2:
+        return np.full((2, *shape), np.nan)
+    ends = [0, *np.cumsum([len(method) for method in together])]
 
     def of_draw(*drawn: np.ndarray) -> np.ndarray:
-        cuts = [0, *ends, len(drawn)]
-        return statistic(*(drawn[start:end] for start, end in pairwise(cuts)))
+        return statistic(*(drawn[start:end] for start, end in pairwise(ends))).ravel()
 
-    flat = [block for own in blocks for block in own]
     with _repeatable():
         _, bounds = _rliable().get_interval_estimates(
             {"": flat}, of_draw, reps=REPETITIONS, confidence_interval_size=CONFIDENCE
         )
-    return bounds[""]
+    return bounds[""].reshape(2, *shape)
 
 
 @contextmanager

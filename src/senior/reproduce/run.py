@@ -10,6 +10,7 @@ from senior.report.results import Run, read
 from senior.reproduce import page
 from senior.reproduce.studies import Arm, Scale, Study, Table, chosen, configuration
 from senior.sweep.cells import Cell
+from senior.sweep.grid import place
 from senior.types import BadInput
 
 
@@ -23,10 +24,11 @@ def studies_of(tables: Sequence[Table], tasks: tuple[str, ...] | None) -> dict[T
 
 
 def folder(out: Path, arm: Arm, task: str, scale: Scale) -> Path:
-    """Where an arm's seeds are; what several studies train is there once."""
-    plain = Arm(arm.method, arm.method)
-    same = configuration(arm, task, 0, scale) == configuration(plain, task, 0, scale)
-    return out / task / (arm.method if same else arm.name)
+    """Where an arm's seeds are, as in `senior.sweep.grid`; what several studies train is there once."""
+    method = arm.options.split()[0]
+    config = configuration(arm, task, 0, scale)
+    same = config == configuration(Arm(method, method), task, 0, scale)
+    return place(out, config, method if same else arm.options).parent
 
 
 def cells(studies: Iterable[Study], seeds: Sequence[int], scale: Scale, out: Path) -> list[Cell]:

@@ -7,11 +7,12 @@ Its main table gives numbers, ``MAIN``. Its figures give none, so there its sent
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from senior.config import Config, Evaluation, Networks, Pretraining
-from senior.presets import preset, with_budget
+from senior.sweep.grid import configured
 
 Scale = Literal["paper", "quick", "smoke"]
 Table = Literal["main", "feedback", "ablation", "quality"]
@@ -43,33 +44,21 @@ AVERAGES: dict[str, tuple[int, int]] = {
 """Its last column."""
 
 
-@dataclass(frozen=True)
-class Arm:
+class Arm(NamedTuple):
     """A method as a study trains it."""
 
     name: str
-    """What it is called in the tables, and the name of its directory."""
-    method: str
-    select: str | None = None
-    explore: str | None = None
-    mix: str | None = None
-    teacher: str | None = None
-    budget: int | None = None
-    """None: the task's."""
+    """What it is called in tables and claims."""
+    options: str
+    """The method with its options, as ``senior sweep --arm`` takes it."""
 
 
 def _plain(*methods: str) -> tuple[Arm, ...]:
     return tuple(Arm(name, name) for name in methods)
 
 
-def with_labels(method: str, budget: int) -> Arm:
-    """A method with another budget."""
-    return Arm(f"{method}-{budget}", method, budget=budget)
-
-
-WITHOUT_PGE = Arm("m-senior-without-pge", "m-senior", explore="none", mix="uniform")
-WITHOUT_MDS = Arm("m-senior-without-mds", "m-senior", select="disagreement")
-NOISY, FILTERED = "mistake", "skip"
+WITHOUT_PGE = Arm("m-senior-without-pge", "m-senior --explore none --mix uniform")
+WITHOUT_MDS = Arm("m-senior-without-mds", "m-senior --select disagreement")
 
 
 @dataclass(frozen=True)
@@ -90,7 +79,11 @@ STUDIES: dict[str, Study] = {
         "Success by feedback budget",
         "Fig. 5",
         ("door-lock", "window-open"),
-        tuple(with_labels(method, budget) for budget in BUDGETS for method in (*BASELINES, "p-senior", "m-senior")),
+        tuple(
+            Arm(f"{method}-{budget}", f"{method} --budget {budget}")
+            for budget in BUDGETS
+            for method in (*BASELINES, "p-senior", "m-senior")
+        ),
     ),
     "ablation": Study(
         "Without MDS, without PGE", "Fig. 6", TASKS, (*_plain("mrn", "m-senior"), WITHOUT_PGE, WITHOUT_MDS)
@@ -101,11 +94,11 @@ STUDIES: dict[str, Study] = {
         ("door-lock", "handle-press"),
         (
             WITHOUT_PGE,  # what that figure calls MDS
-            replace(WITHOUT_PGE, name="mds-fn", teacher=NOISY),
-            replace(WITHOUT_PGE, name="mds-ff", teacher=FILTERED),
+            Arm("mds-fn", f"{WITHOUT_PGE.options} --teacher mistake"),
+            Arm("mds-ff", f"{WITHOUT_PGE.options} --teacher skip"),
             *_plain("qpa"),
-            Arm("qpa-fn", "qpa", teacher=NOISY),
-            Arm("qpa-ff", "qpa", teacher=FILTERED),
+            Arm("qpa-fn", "qpa --teacher mistake"),
+            Arm("qpa-ff", "qpa --teacher skip"),
         ),
     ),
 }
@@ -276,14 +269,16 @@ def configuration(arm: Arm, task: str, seed: int, scale: Scale) -> Config:
     paper: with the paper's numbers. quick: with those of the preset ``quick``, for 100,000 steps. smoke: in a size that
     shows that everything works, and nothing else.
     """
-    config = preset("quick" if scale != "paper" else "paper", task, arm.method)
-    if arm.budget is not None and config.method.learns_reward:
-        config = with_budget(config, arm.budget)
-    method = config.method
-    cells = {name: getattr(arm, name) or getattr(method, name) for name in ("select", "explore", "mix")}
-    config = replace(config, seed=seed, method=replace(method, **cells), teacher=arm.teacher or config.teacher)
+    return replace(_first(arm, task, scale), seed=seed)
+
+
+@cache
+def _first(arm: Arm, task: str, scale: Scale) -> Config:
+    """Of seed 0."""
+    options = {"task": task, "preset": "paper" if scale == "paper" else "quick"}
     if scale == "quick":
-        return replace(config, steps=100_000)
+        options["steps"] = "100000"
+    config = configured(arm.options, options)
     return _smoke(config) if scale == "smoke" else config
 
 

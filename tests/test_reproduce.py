@@ -1,0 +1,222 @@
+"""The paper's studies as grids, the rules by which its numbers and sentences are judged, and the page of a toy run."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from senior.checks import check
+from senior.cli import main
+from senior.cli.shared import BAD_INPUT, DONE
+from senior.report.results import Run, read
+from senior.reproduce import run as reproduce
+from senior.reproduce.studies import (
+    AVERAGES,
+    BUDGETS,
+    CLAIMS,
+    MAIN,
+    SEEDS,
+    STUDIES,
+    TASKS,
+    Claim,
+    Comparison,
+    Quantity,
+    Scale,
+    configuration,
+)
+from senior.reproduce.verdicts import judge_claim, judge_number
+from senior.schedule import plan
+from tests.many_runs import write_run
+from tests.small import small
+
+SCALES: tuple[Scale, ...] = get_args(Scale)
+
+
+def runs_with(tmp_path: Path, arm: str, task: str, rates: Sequence[float], halves: Sequence[float] = ()) -> list[Run]:
+    """Finished runs whose last evaluations are ``rates``, and those after half of the steps ``halves``."""
+    made = []
+    for seed, rate in enumerate(rates):
+        config = replace(small("pebble", task=task), seed=seed, steps=2000)
+        path = write_run(tmp_path / arm / task / f"seed-{seed}", config)
+        half = halves[seed] if halves else rate
+        lines = ["step,labels,queried,episodes,success_rate,return_mean,return_std"]
+        lines += [f"{step},9,9,10,{half if step <= 1000 else rate},0,0" for step in (500, 1000, 1500, 2000)]
+        (path / "eval.csv").write_text("\n".join(lines) + "\n")
+        made.append(path)
+    found = {run.path: run for run in read([tmp_path / arm / task]).runs}
+    return [found[path] for path in made]
+
+
+# The data.
+
+
+def test_the_papers_averages_are_those_of_its_tasks():
+    for method, averages in AVERAGES.items():
+        assert len(MAIN[method]) == len(TASKS)
+        for place, average in enumerate(averages):
+            assert abs(np.mean([numbers[place] for numbers in MAIN[method]]) - average) <= 0.5
+
+
+def test_the_grids_are_the_papers():
+    count = {table: len(study.arms) * len(study.tasks) for table, study in STUDIES.items()}
+    assert count == {"main": 8 * 6, "feedback": 7 * 4 * 2, "ablation": 4 * 6, "quality": 6 * 2}
+    assert set(MAIN) == {arm.name for arm in STUDIES["main"].arms} - {"sac"} == set(AVERAGES)
+    assert SEEDS["paper"] == 5
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_every_cell_can_be_trained_and_no_two_are_alike(scale: Scale, tmp_path: Path):
+    cells = reproduce.cells(STUDIES.values(), range(2), scale, tmp_path)
+    configs = [check(cell.config) for cell in cells]
+    assert len({cell.path for cell in cells}) == len(set(configs)) == len(cells)
+    # trained once: seven arms with 250 labels; the ablation's mrn and m-senior; the quality study's MDS and QPA
+    shared = 7 * 2 + 2 * 6 + 2 * 2
+    alone = sum(len(study.arms) * len(study.tasks) for study in STUDIES.values())
+    assert len(cells) == 2 * (alone - shared)
+    assert {cell.config.preset for cell in cells} == {"paper" if scale == "paper" else "quick"}
+    for cell in cells:
+        if cell.config.method.learns_reward:
+            told = plan(cell.config)
+            assert told.queried == cell.config.queries.budget, f"{cell} cannot spend its budget"
+
+
+def test_arms_are_what_the_paper_says():
+    arms = {arm.name: arm for study in STUDIES.values() for arm in study.arms}
+    made = {name: configuration(arm, "door-lock", 3, "paper") for name, arm in arms.items()}
+    assert all(config.seed == 3 and config.steps == 1_000_000 for config in made.values())
+    assert [made[f"m-senior-{budget}"].queries.budget for budget in BUDGETS] == list(BUDGETS)
+    without = made["m-senior-without-pge"].method
+    assert (without.select, without.explore, without.mix, without.outer) == (
+        "motion_distinction",
+        "none",
+        "uniform",
+        "bilevel",
+    )
+    without = made["m-senior-without-mds"].method
+    assert (without.select, without.explore) == ("disagreement", "preference_guided")
+    assert made["mds-fn"].teacher == made["qpa-fn"].teacher == "mistake"
+    assert made["mds-ff"].teacher == made["qpa-ff"].teacher == "skip"
+    assert configuration(arms["m-senior"], "door-lock", 0, "quick").steps == 100_000
+
+
+def test_claims_speak_of_what_is_trained():
+    for claim in CLAIMS:
+        study = STUDIES[claim.table]
+        names = {arm.name for arm in study.arms}
+        assert claim.comparisons
+        for comparison in claim.comparisons:
+            for quantity in (comparison.higher, comparison.lower):
+                if isinstance(quantity, Quantity):
+                    assert quantity.arm in names and set(quantity.tasks) <= set(study.tasks)
+
+
+# The rules.
+
+
+@pytest.mark.parametrize(
+    ("rates", "paper", "verdict"),
+    [
+        ([0.9, 1.0, 1.0, 0.9, 1.0], 0.98, "reproduced"),
+        ([1.0] * 5, 1.0, "reproduced"),
+        ([0.9, 1.0, 1.0, 0.9, 1.0], 0.75, "not reproduced"),
+        ([0.0, 1.0, 0.0, 1.0, 1.0], 0.98, "undecided"),
+        ([1.0], 1.0, "undecided"),
+    ],
+)
+def test_numbers_are_judged_by_the_interval_of_our_mean(rates: list[float], paper: float, verdict: str, tmp_path: Path):
+    runs = {("mrn", "door-lock"): runs_with(tmp_path, "mrn", "door-lock", rates)}
+    judged = judge_number(paper, runs, "mrn", ("door-lock",), "end")
+    assert (judged.verdict, judged.seeds) == (verdict, len(rates))
+    assert judged.ours is not None and judged.ours.mean == pytest.approx(np.mean(rates))
+    assert judge_number(paper, runs, "mrn", ("door-open",), "end").verdict == "missing"
+
+
+def test_the_number_of_seeds_that_would_decide(tmp_path: Path):
+    rates = [0.5, 0.7, 0.9, 0.6, 0.8]  # 0.7, and a deviation above what ten episodes leave open
+    runs = {("mrn", "door-lock"): runs_with(tmp_path, "mrn", "door-lock", rates)}
+    judged = judge_number(0.75, runs, "mrn", ("door-lock",), "end")
+    deviation = np.std(rates, ddof=1)
+    needed = next(
+        n for n in range(6, 1000) if stats.t.ppf(0.95, n - 1) * deviation / np.sqrt(n) <= 0.05 + 1e-9
+    )  # from 0.7 - 0.05 to 0.7 + 0.05 lies within 0.65 and 0.85
+    assert (judged.verdict, judged.needed) == ("undecided", needed)
+    assert judge_number(0.6, runs, "mrn", ("door-lock",), "end").needed is None, "its mean lies on the border"
+
+
+def test_an_average_over_tasks_is_judged_as_one_number(tmp_path: Path):
+    rates = {task: [place / 10, place / 10 + 0.1] for place, task in enumerate(TASKS)}
+    runs = {("mrn", task): runs_with(tmp_path, "mrn", task, rates[task], [0.0, 0.0]) for task in TASKS}
+    judged = judge_number(0.3, runs, "mrn", TASKS, "end")
+    assert judged.ours is not None and judged.ours.mean == pytest.approx(np.mean(list(rates.values())))
+    half = judge_number(0.0, runs, "mrn", TASKS, "half")
+    assert half.ours is not None and half.ours.mean == 0.0
+    curve = judge_number(0.0, runs, "mrn", TASKS, "curve")
+    assert curve.ours is not None and half.ours.mean < curve.ours.mean < judged.ours.mean
+
+
+def test_a_claim_holds_if_all_of_it_does(tmp_path: Path):
+    runs = {
+        ("best", "door-lock"): runs_with(tmp_path, "best", "door-lock", [1.0, 0.9, 1.0, 1.0, 0.9]),
+        ("good", "door-lock"): runs_with(tmp_path, "good", "door-lock", [0.6, 0.5, 0.6, 0.7, 0.6]),
+        ("wild", "door-lock"): runs_with(tmp_path, "wild", "door-lock", [1.0, 0.0, 1.0, 1.0, 0.9]),
+    }
+
+    def verdict(*pairs: tuple[str, str | float, float]) -> str:
+        comparisons = tuple(
+            Comparison(
+                Quantity(higher, ("door-lock",)),
+                Quantity(lower, ("door-lock",)) if isinstance(lower, str) else lower,
+                margin,
+            )
+            for higher, lower, margin in pairs
+        )
+        return judge_claim(Claim("main", "", "", comparisons), runs).verdict
+
+    assert verdict(("best", "good", 0.0), ("best", 0.8, 0.0)) == "confirmed"
+    assert verdict(("best", "good", 0.0), ("good", "best", 0.0)) == "refuted"
+    assert verdict(("best", "good", 0.0), ("best", "wild", 0.0)) == "undecided"
+    assert verdict(("best", "good", 0.0), ("best", "gone", 0.0)) == "undecided"
+    assert verdict(("best", "gone", 0.0), ("gone", 0.5, 0.0)) == "missing"
+    assert verdict(("best", "good", 0.6)) == "refuted", "the margin counts"
+    assert verdict(("good", "best", -0.6)) == "confirmed"
+
+
+# The command.
+
+
+def test_what_the_paper_has_not_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for options, said in (
+        ("senior --tasks door-close", "door-close"),
+        ("senior --seeds 0", "--seeds must be at least 1"),
+        ("pebble", "senior"),
+        ("senior --table fig9", "ablation"),
+    ):
+        assert main(["reproduce", *options.split(), "--out", str(tmp_path)]) == BAD_INPUT
+        assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_main_table_in_toy_sizes(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    command = ["reproduce", "senior", "--table", "main", "--scale", "smoke", "--seeds", "1", "--out", str(tmp_path)]
+    assert main(command) == DONE
+    told = capsys.readouterr().out
+    assert "48 of 48 cells are finished" in told and "Toy sizes" in told
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert "The numbers mean nothing" in page
+    with open(tmp_path / "report" / "tables" / "beside-the-paper.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 7 * (6 + 1)
+    assert {row["verdict"] for row in rows} == {"undecided"}, "one seed decides nothing"
+    row = next(row for row in rows if (row["method"], row["task"], row["when"]) == ("m-senior", "door-open", "end"))
+    assert float(row["paper"]) == 1.0
+    with open(tmp_path / "door-open" / "m-senior" / "seed-0" / "eval.csv") as file:
+        assert float(row["ours"]) == float(list(csv.DictReader(file))[-1]["success_rate"])
+    assert main([*command, "--no-train"]) == DONE
+    assert (tmp_path / "report" / "index.html").read_text() == page
