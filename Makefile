@@ -35,7 +35,7 @@ install: .venv/.installed  ## install the program and what it needs into .venv
 .venv/.installed: requirements.lock pyproject.toml
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 \
 		|| { $(CHOOSE_PYTHON); echo "Making .venv with $$python"; "$$python" -m venv --clear .venv; }
-	@echo "Installing into .venv (1.4 GB; some minutes the first time)"
+	@echo "Installing into .venv (1.7 GB; some minutes the first time)"
 	@$(BIN)/python $(PIP) install --require-hashes -r requirements.lock
 	@$(BIN)/python $(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@

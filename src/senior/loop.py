@@ -317,6 +317,7 @@ class Training:
                 "explored": np.asarray(bonus.curiosity.observation)[:, trainee.spec.position],
                 "intrinsic": np.asarray(bonus.intrinsic),
                 "beta": np.asarray(bonus.beta),
+                "length_scale": np.asarray(self.runs.view(i, lambda run: run.length_scale)),
             }
         trainee.directory.snapshot(step, positions, behind)
 

@@ -169,8 +169,12 @@ def report(arguments: list[str]) -> int:
     from senior.report.build import report
 
     built = report(options.runs, options.out)
+    reasons: dict[str, list[Path]] = {}
     for path, reason in built.left_out:
-        print(f"left out: {path}: {reason}", file=sys.stderr)
+        reasons.setdefault(reason, []).append(path)
+    for reason, paths in reasons.items():
+        more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+        print(f"left out: {paths[0]}{more}: {reason}", file=sys.stderr)
     print(f"{built.runs} runs: {built.page}")
     return DONE
 
@@ -189,7 +193,11 @@ class WatchOptions:
 
 def watch(arguments: list[str]) -> int:
     options = parse(WatchOptions, arguments, None, "watch")
-    from senior.report.watch import serve
-
+    try:
+        from senior.report.watch import serve
+    except ImportError as error:
+        raise BadInput(
+            f"The live page needs {error.name}, which is not installed: pip install 'senior-rl[report]'"
+        ) from None
     serve(options.runs, options.host, options.port)
     return DONE

@@ -1,0 +1,114 @@
+"""The pairs that a run asked, as arrays, from its preference file. Imports no JAX."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from senior.envs.metaworld import POSITION, TASKS
+from senior.preference_file import BUSY_SECONDS, SCHEMA_VERSION
+from senior.report.results import Run, Unusable
+
+FILE = "preferences.sqlite"
+OBJECT = slice(4, 7)
+"""Where Meta-World's observation holds the place of the object, in metres."""
+
+
+class Asked(NamedTuple):
+    """The pairs of a run, in the order of asking. Reserves that were not needed are left out."""
+
+    id: np.ndarray
+    """``[P]``"""
+    session: np.ndarray
+    """``[P]``"""
+    step: np.ndarray
+    """``[P]`` at which it was asked."""
+    position: np.ndarray
+    """``[P, 2, H, d]``: the end-effector's path in both segments."""
+    object: np.ndarray | None
+    """``[P, 2, 3]``: where the object was when each segment began; None where it is not known."""
+    returns: np.ndarray
+    """``[P, 2]``: true return of each segment."""
+    scores: list[dict[str, float]]
+    """Per pair, what selection knew of it."""
+    second: np.ndarray
+    """``[P]``: P(second preferred) that is trained on; NaN where skipped or not answered yet."""
+    collected: np.ndarray
+    """``[P]``: whether its answer was taken."""
+
+    @property
+    def skipped(self) -> np.ndarray:
+        """``[P]``: whether nobody could tell."""
+        return self.collected & np.isnan(self.second)
+
+
+def place_of(run: Run) -> slice | None:
+    """Where the end-effector's position lies in the observation; None where nothing says so."""
+    told = run.protocol.get("position")
+    if isinstance(told, list) and len(told) == 2:
+        return slice(*told)
+    return POSITION if run.arm.task in TASKS else None
+
+
+def asked(run: Run) -> Asked | None:
+    """What a run asked; None if it asks nothing or has not begun to. Raises `Unusable` with the reason.
+
+    The file is only read, and nothing is left beside it.
+    """
+    path = run.path / FILE
+    if not run.asks or not path.exists():
+        return None
+    where = place_of(run)
+    if where is None:
+        raise Unusable(f"{FILE} cannot be used: config.json does not say where the position lies")
+    try:
+        with closing(_open(path)) as db:
+            version = db.execute("PRAGMA user_version").fetchone()[0]
+            if version != SCHEMA_VERSION:
+                raise Unusable(f"{FILE} has schema version {version}; this program reads {SCHEMA_VERSION}")
+            steps, size, _ = db.execute("SELECT * FROM shape").fetchone()
+            rows = db.execute(
+                "SELECT id, session, step, observation, reward, scores, second, collected_step FROM pairs "
+                "WHERE reserve = 0 OR collected_step IS NOT NULL ORDER BY id"
+            )
+            return _arrays(rows, (2, steps, size), where, run.arm.task in TASKS)
+    except (sqlite3.Error, ValueError, TypeError) as error:
+        raise Unusable(f"{FILE} is damaged: {error}") from error
+
+
+def _open(path: Path) -> sqlite3.Connection:
+    """Open it to be read. While a run writes it there is a log beside it; without one, opening it would make one."""
+    how = "mode=ro" if path.with_name(path.name + "-wal").exists() else "immutable=1"
+    return sqlite3.connect(f"{path.absolute().as_uri()}?{how}", uri=True, timeout=BUSY_SECONDS)
+
+
+def _arrays(rows: sqlite3.Cursor, shape: tuple[int, int, int], where: slice, object_told: bool) -> Asked | None:
+    numbers, position, objects, returns, scores, second, collected = [], [], [], [], [], [], []
+    for *number, observation, reward, score, label, step in rows:
+        seen = np.frombuffer(observation, "<f4").reshape(shape)
+        numbers.append(number)
+        position.append(seen[..., where].copy())  # the rest is let go of
+        objects.append(seen[:, 0, OBJECT].copy())
+        returns.append(np.frombuffer(reward, "<f4").reshape(shape[:2]).sum(axis=1, dtype=float))
+        scores.append({str(name): float(value) for name, value in json.loads(score).items()})
+        second.append(np.nan if label is None else float(label))
+        collected.append(step is not None)
+    if not numbers:
+        return None
+    ids, sessions, steps = np.array(numbers).T
+    return Asked(
+        ids,
+        sessions,
+        steps,
+        np.array(position, float),
+        np.array(objects, float) if object_told else None,
+        np.array(returns),
+        scores,
+        np.array(second),
+        np.array(collected),
+    )
