@@ -646,3 +646,20 @@ def test_budgets_stand_beside_each_other(tmp_path: Path):
     assert [row[1:4] for row in drawing.rows[1:]] == [("m-senior", 250, 2), ("m-senior", 500, 2)]
     assert [row[4] for row in drawing.rows[1:]] == pytest.approx([0.55, 0.95])
     assert across.budget_curves("door-lock", {"mrn": arms["mrn"]}) is None
+
+
+def test_what_all_arms_have_is_told_once(tmp_path: Path):
+    for method in ("mrn", "pebble", "sac"):
+        config = preset("quick", "door-lock", method)
+        config = replace(config, steps=1000, networks=replace(config.networks, width=16))
+        if method == "mrn":
+            config = replace(config, method=replace(config.method, select="entropy"))
+        write_run(tmp_path / method, config)
+    found = read([tmp_path])
+    assert found.shared == ("--networks.width 16",)
+    assert {run.arm.label for run in found.runs} == {"mrn --select entropy", "pebble", "sac"}
+    alone = read([tmp_path / "pebble", tmp_path / "sac"])
+    assert not alone.shared and {run.arm.label for run in alone.runs} == {
+        "pebble --networks.width 16",
+        "sac --networks.width 16",
+    }

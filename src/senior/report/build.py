@@ -47,7 +47,7 @@ def report(places: Sequence[Path], out: Path, first: Sequence[Section] = (), unf
 
 def _parts(results: Results, tasks: sections.Tasks, colours: Mapping[str, Look]) -> Iterator[Section | None]:
     """One by one, when they are asked for."""
-    yield sections.summary(tasks)
+    yield sections.summary(tasks, results.shared)
     yield sections.curves(tasks, colours)
     yield sections.labels(tasks, colours)
     yield sections.comparison(tasks, colours)

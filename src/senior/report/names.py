@@ -63,28 +63,32 @@ def _options(kind: type[Any], dotted: str, prefix: str) -> Iterator[tuple[str, O
 
 
 def label(config: Config) -> str:
-    """The method's name and the options that its preset would need to become this configuration.
+    """The method's name and its `words`."""
+    return " ".join([config.method.name, *words(config)])
+
+
+def words(config: Config) -> tuple[str, ...]:
+    """The options that the preset of the method would need to become this configuration.
 
     Left out is what is no part of a method: seed, device, and how long a run lasts, is evaluated and is saved. A budget
     brings its pairs per session with it, ``--compat release`` all that it means, and a teacher its numbers.
     """
-    name = config.method.name
     try:
-        start = preset(config.preset, config.task, name)
+        start = preset(config.preset, config.task, config.method.name)
     except BadInput:  # a row that is gone
-        return name
-    words, own = [], normal(config)
+        return ()
+    said, own = [], normal(config)
     if own.queries.budget != start.queries.budget:
         start = with_budget(start, own.queries.budget)
-        words.append(options()["queries.budget"].said(own.queries.budget))
+        said.append(options()["queries.budget"].said(own.queries.budget))
     if own.compat == "release":
         start = replace(release(start), compat="none")
     start = replace(start, answering=normal(replace(start, teacher=own.teacher)).answering)
     silent = (*UNNAMED, *(OF_ENVIRONMENT if own.env else ()))
     for dotted, _, value in differences(start, own):
         if dotted.split(".")[0] not in silent:
-            words.append(options()[dotted].said(_short(dotted, value)))
-    return " ".join([name, *words])
+            said.append(options()[dotted].said(_short(dotted, value)))
+    return tuple(said)
 
 
 def normal(config: Config) -> Config:

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from senior.config import Config, from_json, to_json
-from senior.report.names import label, normal, options
+from senior.report.names import label, normal, options, words
 from senior.types import BadInput
 
 APART = ("seed", "device", "checkpoint_every", "snapshot_every")
@@ -149,6 +149,8 @@ class Results(NamedTuple):
     runs: tuple[Run, ...]
     """By task, label and seed."""
     left_out: tuple[LeftOut, ...]
+    shared: tuple[str, ...] = ()
+    """Options that all arms have and their labels do not tell."""
 
     def arms(self) -> dict[Arm, list[Run]]:
         """Runs by arm, both in order."""
@@ -174,8 +176,8 @@ def read(places: Sequence[Path], unfinished: bool = False) -> Results:
         except Unusable as reason:
             left_out.append(LeftOut(path, str(reason)))
     runs = _of_one_measure(runs, left_out)
-    runs = _once(runs, left_out)
-    return Results(tuple(sorted(_told_apart(runs), key=_order)), tuple(left_out))
+    runs, shared = _unshared(_once(runs, left_out))
+    return Results(tuple(sorted(_told_apart(runs), key=_order)), tuple(left_out), shared)
 
 
 def _order(run: Run) -> tuple[Any, ...]:
@@ -403,6 +405,22 @@ def _once(runs: list[Run], left_out: list[LeftOut]) -> list[Run]:
         if first is not run:
             left_out.append(LeftOut(run.path, f"seed {run.seed} of {run.arm} was taken from {first.path} already"))
     return list(kept.values())
+
+
+def _unshared(runs: Sequence[Run]) -> tuple[list[Run], tuple[str, ...]]:
+    """Runs of several methods without the options that all of those that ask people have, and these options."""
+    asking = [words(run.config) for run in runs if run.asks and run.config is not None]
+    if len({run.method for run in runs if run.asks}) < 2 or not asking:
+        return list(runs), ()
+    shared = tuple(word for word in asking[0] if all(word in own for own in asking))
+    return [
+        replace(
+            run, arm=replace(run.arm, name=" ".join([run.method, *(w for w in words(run.config) if w not in shared)]))
+        )
+        if run.config is not None
+        else run
+        for run in runs
+    ], shared
 
 
 def _told_apart(runs: Sequence[Run]) -> list[Run]:

@@ -54,8 +54,11 @@ def by_task(runs: Sequence[Run]) -> dict[str, dict[str, list[Run]]]:
 # What is reached.
 
 
-def summary(tasks: Tasks) -> Section:
-    """Success at two steps, intervals and areas, a line per arm; with several tasks, the paper's table too."""
+def summary(tasks: Tasks, shared: Sequence[str] = ()) -> Section:
+    """Success at two steps, intervals and areas, a line per arm; with several tasks, the paper's table too.
+
+    shared: options of all arms, which their labels do not tell.
+    """
     by_marks: dict[tuple[int, int], dict[str, dict[str, Sequence[Run]]]] = defaultdict(lambda: defaultdict(dict))
     for task, arms in tasks.items():
         for label, runs in arms.items():
@@ -75,6 +78,8 @@ def summary(tasks: Tasks) -> Section:
         "were judged allow; that of the interquartile mean is by the bootstrap. Areas are the mean over all steps, or "
         "over all asked pairs."
     ]
+    if shared:
+        text.append(f"All arms have, beside what their names tell: {' '.join(shared)}.")
     short = sorted({run.steps for run in runs if run.steps < PAPER[1]})
     if short:
         text.append(
