@@ -52,8 +52,8 @@ def third_party_imports(source: str) -> Iterator[tuple[str, bool]]:
     return ((name, deferred) for name, deferred in visit(ast.parse(source), False) if name not in ours)
 
 
-LABEL = {"label/app.py", "label/guard.py", "label/server.py"}
-"""Modules that are imported by functions only, so that they may need the extra ``label``."""
+ON_CALL = {"label/app.py", "label/guard.py", "label/server.py", "report/watch.py"}
+"""Modules that are imported by functions only, so that they may need an extra."""
 
 
 def test_imports_are_declared():
@@ -64,7 +64,7 @@ def test_imports_are_declared():
     providers = importlib.metadata.packages_distributions()
     seen, undeclared = set(), set()
     for path in (ROOT / "src").rglob("*.py"):
-        on_call = str(path.relative_to(ROOT / "src" / "senior")) in LABEL
+        on_call = str(path.relative_to(ROOT / "src" / "senior")) in ON_CALL
         for name, deferred in third_party_imports(path.read_text()):
             provided_by = {canonicalize_name(provider) for provider in providers.get(name, [name])}
             seen.add(name)
@@ -74,26 +74,32 @@ def test_imports_are_declared():
     assert {"jax", "numpy"} <= seen
 
 
-def test_what_needs_an_extra_is_imported_by_functions_only():
-    """Without ``label`` installed everything else works, and asking for it says what to install."""
+def test_what_needs_an_extra_is_imported_by_functions_only(tmp_path: Path):
+    """Without extras installed everything else works, and asking for what needs one says what to install."""
     script = """
 import importlib.util, sys
-missing = ("fastapi", "starlette", "uvicorn", "jinja2", "pydantic", "statsmodels")
+missing = ("fastapi", "starlette", "uvicorn", "jinja2", "pydantic", "statsmodels", "rliable", "pandas", "ray")
 class Missing:
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] in missing:
             raise ModuleNotFoundError(name)
 sys.meta_path.insert(0, Missing())
-import senior.program, senior.cli, senior.labels, senior.label.clips
+import senior.program, senior.cli, senior.labels, senior.label.clips, senior.report.build, senior.sweep.cluster
 find = importlib.util.find_spec
 importlib.util.find_spec = lambda name: None if name in missing else find(name)
 code = senior.cli.main(["train", "--task", "point", "--method", "pebble", "--teacher", "human", "--out", sys.argv[1]])
 assert code == 2, code
+assert senior.cli.main(["report", sys.argv[2], "--out", sys.argv[1]]) == 2
+assert senior.cli.main(["watch", sys.argv[2]]) == 2
+assert senior.cli.main(["sweep", "--task", "point", "--out", sys.argv[3], "--ray", "127.0.0.1:9"]) == 2
 """
-    out = ROOT / "runs" / "never"
-    done = subprocess.run([sys.executable, "-c", script, out], capture_output=True, text=True, timeout=120)
+    out, runs = ROOT / "runs" / "never", ROOT / "results" / "methods" / "runs"
+    done = subprocess.run(
+        [sys.executable, "-c", script, out, runs, tmp_path], capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stderr
-    assert "pip install 'senior-rl[label]'" in done.stderr
+    told = done.stderr.splitlines()
+    assert [line[line.index("[") :] for line in told] == ["[label]'", "[report]'", "[report]'", "[ray]'"], done.stderr
     assert not out.exists()
 
 

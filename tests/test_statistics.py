@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from senior.report.statistics import (
     profiles,
     rank_correlation,
 )
-from senior.types import BadInput
 
 RATES = [0.8, 0.9, 1.0, 0.7, 0.4]
 MANY = 10_000  # episodes that leave nothing open
@@ -196,12 +194,6 @@ def test_the_bootstrap_repeats_itself_and_leaves_the_global_generator_alone():
     first, second = interquartile_means(own)["one"], interquartile_means(own)["one"]
     assert np.array_equal(first, second)
     assert np.random.random() == expected  # noqa: NPY002
-
-
-def test_without_rliable_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "rliable", None)
-    with pytest.raises(BadInput, match=r"senior-rl\[report\]"):
-        interquartile_means({"one": [np.array([0.4, 0.5])]})
 
 
 def test_areas_are_means_over_steps_and_over_labels():

@@ -1,8 +1,8 @@
 """A run's directory: its files, their columns, and how long each was at a checkpoint (README, "The run directory").
 
 CSV files are the truth; TensorBoard mirrors them. Nothing that depends on the clock is written outside
-``timing.csv`` (whose length checkpoints remember), ``tensorboard/``, ``status.json`` and the time of an answer, so equal seeds give
-equal files.
+``timing.csv`` (whose length checkpoints remember), ``tensorboard/``, ``status.json`` and the time of an answer, so
+equal seeds give equal files.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ class RunDirectory:
             file.write(f"{datetime.now(UTC).isoformat(timespec='seconds')} {sentence}\n")
 
     def tell(self, status: Mapping[str, Any]) -> None:
-        """What the run is doing now, for the labelling page and for sweeps. It need not outlive a crash of the machine."""
+        """What the run is doing now, for whoever looks on. It need not outlive a crash of the machine."""
         new = self.path / "status.json.tmp"
         new.write_text(json.dumps(status))
         os.replace(new, self.path / "status.json")

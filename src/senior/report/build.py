@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -34,6 +35,11 @@ def report(places: Sequence[Path], out: Path, first: Sequence[Section] = (), unf
     Raises `BadInput` if there is no run with an evaluation, if ``out`` cannot be written, or if what draws the page is
     not installed.
     """
+    missing = [name for name in ("jinja2", "rliable") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise BadInput(
+            f"A report needs {' and '.join(missing)}, which is not installed: pip install 'senior-rl[report]'"
+        )
     results = read(places, unfinished)
     if not results.runs:
         raise BadInput(_nothing(places, results))

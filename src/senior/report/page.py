@@ -78,7 +78,7 @@ def write(sections: Iterable[Section], out: Path, title: str) -> Path:
     sections are made one by one, memory for the largest of them is enough. Names are made safe for files and, where two
     are the same, told apart by a number.
 
-    Raises `BadInput` if ``out`` cannot be written, or Jinja is not installed.
+    Raises `BadInput` if ``out`` cannot be written.
     """
     template = _template()
     try:
@@ -180,12 +180,8 @@ def _beside(place: Path, suffix: str) -> Path:
 
 
 def _template() -> Any:
-    try:
-        from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    except ImportError as error:
-        raise BadInput(
-            "The report's page needs jinja2, which is not installed: pip install 'senior-rl[report]'"
-        ) from error
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
     loader = FileSystemLoader(Path(__file__).parent)
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True

@@ -100,9 +100,10 @@ def _draw(task: str, told: Mapping[str, Mapping[int, Asked]], plane: Plane, look
     heads = [f"{label}, seed {seed}" for label, (seed, _) in firsts.items()]
     rows: list[Sequence[Cell]] = [("task", "arm", "seed", "pair", "segment", "second_preferred", "time", *plane.labels)]
     with matplotlib.rc_context(STYLE):
-        drawn = panels(plane, heads, [""] * (SESSIONS * OF_SESSION), SIDE, room=0.34, right=0.15)
-        for (label, (seed, pairs)), row in zip(firsts.items(), drawn.rows, strict=True):
-            for panel, i in zip(row, shown(pairs), strict=False):
+        chosen = [shown(pairs) for _, pairs in firsts.values()]
+        drawn = panels(plane, heads, [""] * max(map(len, chosen)), SIDE, room=0.34, right=0.15)
+        for (label, (seed, pairs)), row, own in zip(firsts.items(), drawn.rows, chosen, strict=True):
+            for panel, i in zip(row, own, strict=False):
                 paths = plane.of(pairs.position[i])
                 panel.frame()
                 panel.title(_title(pairs, i))

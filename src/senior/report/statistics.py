@@ -24,8 +24,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
-from senior.types import BadInput
-
 REPETITIONS = 2000
 """Draws of a bootstrap."""
 CONFIDENCE = 0.95
@@ -245,8 +243,10 @@ def _bootstrap(together: Sequence[Blocks], statistic: Callable[..., np.ndarray])
     def of_draw(*drawn: np.ndarray) -> np.ndarray:
         return statistic(*(drawn[start:end] for start, end in pairwise(ends))).ravel()
 
+    from rliable import library  # takes a second, and is not installed by default
+
     with _repeatable():
-        _, bounds = _rliable().get_interval_estimates(
+        _, bounds = library.get_interval_estimates(
             {"": flat}, of_draw, reps=REPETITIONS, confidence_interval_size=CONFIDENCE
         )
     return bounds[""].reshape(2, *shape)
@@ -261,17 +261,6 @@ def _repeatable() -> Iterator[None]:
         yield
     finally:
         np.random.set_state(before)  # noqa: NPY002
-
-
-def _rliable() -> Any:
-    """The library that draws. It takes a second to import, and is not installed by default."""
-    try:
-        from rliable import library
-    except ImportError as error:
-        raise BadInput(
-            "Intervals by the bootstrap need rliable, which is not installed: pip install 'senior-rl[report]'"
-        ) from error
-    return library
 
 
 # Of one run.

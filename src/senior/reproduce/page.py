@@ -57,7 +57,7 @@ def _numbers(study: Study, scale: Scale, runs: Runs) -> Section:
     columns = [*study.tasks, *(["average"] if study.tasks == TASKS else [])]
     tables = [
         Table(
-            f"Success at {steps} steps: the paper's, ours and its interval, in percent.",
+            f"Success at {steps} steps, in percent: the paper's | ours [its 90 % interval].",
             ["method", *columns],
             [[arm, *(_cell(verdicts[arm, column, when]) for column in columns)] for arm in MAIN],
             name=f"beside-the-paper-{when}",
@@ -66,7 +66,7 @@ def _numbers(study: Study, scale: Scale, runs: Runs) -> Section:
     ]
     rows = [_row(*key, verdict) for key, verdict in verdicts.items()]
     head = ["method", "task", "when", "paper", "ours", "low", "high", "seeds", "verdict", "seeds that would decide"]
-    tables.append(Table("The same, a row per number.", head, rows, name="beside-the-paper"))
+    tables.append(Table("The same, a row per number.", head, rows, name="beside-the-paper", folded=True))
     counts = Counter(verdict.verdict for verdict in verdicts.values())
     told = ", ".join(f"{count} {kind}" for kind, count in counts.most_common())
     return Section(
@@ -76,13 +76,13 @@ def _numbers(study: Study, scale: Scale, runs: Runs) -> Section:
 
 def _cell(verdict: Verdict) -> str:
     if verdict.ours is None:
-        return f"{verdict.paper:.0%} | -"
+        return f"{100 * verdict.paper:.0f} | -"
     needed = f" ({verdict.needed or 'over 1,000'})" if verdict.verdict == "undecided" and verdict.seeds > 1 else ""
-    return f"{verdict.paper:.0%} | {_interval(verdict.ours)} {verdict.verdict}{needed}"
+    return f"{100 * verdict.paper:.0f} | {_interval(verdict.ours)} {verdict.verdict}{needed}"
 
 
 def _interval(interval: Interval) -> str:
-    return f"{interval.mean:.0%} [{interval.low:.0%}, {interval.high:.0%}]"
+    return "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * bound for bound in interval))
 
 
 def _row(arm: str, task: str, when: str, verdict: Verdict) -> list[Cell]:
@@ -115,6 +115,7 @@ def _claims(claims: Sequence[Judged], scale: Scale) -> Section:
                 ["table", "higher", "lower", "difference", "low", "high", "margin"],
                 [row for judged in claims for row in _comparisons(judged)],
                 name="comparisons",
+                folded=True,
             ),
         ),
     )
