@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from senior import health, loop, session
-from senior.program import Quiet, make_learner, spec_of
+from senior.fit import spec_of
+from senior.program import Quiet, make_learner
 from senior.runs import Runs
 from senior.trainee import Trainee
 from tests.small import small

@@ -16,10 +16,11 @@ import pytest
 from senior import checkpoint, loop
 from senior.agent.sac import Agent
 from senior.files import unpack
+from senior.fit import spec_of
 from senior.learner import Learner, Run
 from senior.methods import METHODS
 from senior.preferences import Preferences
-from senior.program import Quiet, make_learner, spec_of, train
+from senior.program import Quiet, make_learner, train
 from senior.replay import Fact
 from senior.reward.bilevel import FirstSteps
 from senior.reward.model import EQUAL, Labelled, rewards

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from senior import replay
-from senior.program import make_learner, spec_of
+from senior.fit import spec_of
+from senior.program import make_learner
 from senior.reward.model import Snippets, window_sums
 from senior.trainee import Trainee
 from senior.types import Source

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from senior import cli
 from senior.checkpoint import steps
+from senior.cli.display import Display
+from senior.cli.shared import DONE, INTERRUPTED
 from senior.config import Answering, Config, load
 from senior.envs.point import Point
 from senior.judgement import load_policy
@@ -126,15 +127,15 @@ def test_interrupted_on_the_command_line_again_and_again(reference: Path, tmp_pa
     """SIGINT in training, SIGTERM in what goes on, and a third process that comes to the end."""
     run = tmp_path / "seed-0"
     first = senior("SIGINT:575", "train", *OPTIONS, "--out", tmp_path)
-    assert first.returncode == cli.INTERRUPTED == 130, first.stderr
+    assert first.returncode == INTERRUPTED == 130, first.stderr
     assert f"interrupted at step 576, all saved; go on with: senior resume {run}" in first.stdout
     assert steps(run / "checkpoints")[0] == 576
     second = senior("SIGTERM:777", "resume", run)
-    assert second.returncode == cli.INTERRUPTED, second.stderr
+    assert second.returncode == INTERRUPTED, second.stderr
     assert "interrupted at step 778, all saved" in second.stdout
     assert steps(run / "checkpoints")[0] == 778
     third = senior(None, "resume", run)
-    assert third.returncode == cli.DONE, third.stderr
+    assert third.returncode == DONE, third.stderr
     assert_same_run(run, reference / "seed-0", interrupted=True)
     last = [int(path.stem.split("-")[2]) for path in sorted((run / "checkpoints").glob("facts-*.npz"))]
     first_rows = [int(path.stem.split("-")[1]) for path in sorted((run / "checkpoints").glob("facts-*.npz"))]
@@ -145,7 +146,7 @@ def test_interrupted_on_the_command_line_again_and_again(reference: Path, tmp_pa
 def test_a_second_signal_ends_the_program_at_once():
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        display = cli.Display()
+        display = Display()
         os.kill(os.getpid(), signal.SIGTERM)
         assert display.stop
         with pytest.raises(KeyboardInterrupt):

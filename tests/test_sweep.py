@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -12,6 +13,7 @@ import time
 from collections import deque
 from dataclasses import replace
 from io import StringIO
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +23,14 @@ from rich.console import Console
 from senior.cli import main
 from senior.cli.shared import BAD_INPUT, DONE, INTERRUPTED
 from senior.envs.point import Point
-from senior.rundir import threads
+from senior.rundir import HELD, RunDirectory, threads
 from senior.sweep.board import Board
 from senior.sweep.cells import Cell, Done, Job, Outcome, check_cells, is_finished, job_of, order, outcomes_of, report
-from senior.sweep.grid import cells_of, read, split
+from senior.sweep.grid import cells_of, merged, read, split
+from senior.sweep.local import LocalCrew
 from senior.sweep.run import run
 from senior.sweep.scheduler import RETRIES, Sweep
+from senior.sweep.worker import Watch, train
 from senior.types import BadInput
 from tests.equal import OPTIONS, assert_same_run, short
 
@@ -91,6 +95,16 @@ def test_a_grid_in_a_file(tmp_path: Path):
     )
 
 
+def test_options_beside_a_file_win():
+    file = {"method": ["mrn"], "wait": [], "seed": ["0"], "replay-capacity": ["9"]}
+    assert merged(file, {"arm": ["pebble"], "no-wait": [], "seed": ["1", "2"]}) == {
+        "replay-capacity": ["9"],
+        "arm": ["pebble"],
+        "no-wait": [],
+        "seed": ["1", "2"],
+    }
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -117,13 +131,18 @@ def test_a_file_that_is_no_grid_is_refused(content: str, said: str, tmp_path: Pa
         ("--method sac --outer bilevel", "makes no sense"),
         ("--teacher human", "does not wait for people"),
         ("--jobs 0", "--jobs 0 must be between"),
+        ("--precision bfloat16", "is not offered"),
+        ("--segment 600", "does not fit into an episode"),
+        ("--env nosuch:Thing", "nosuch"),
+        ("--env tests.test_sweep:Fragile", "--position"),
+        (r"--arm=mrn --budget=50 --arm=pebble\ --budget\ 100", "a --budget of its own"),
         ("--file nowhere.toml", "nowhere.toml cannot be read"),
     ],
 )
 def test_what_makes_no_sense_is_refused_before_anything_runs(
     options: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    assert main(["sweep", "--out", str(tmp_path / "out"), "--device", "cpu", *options.split()]) == BAD_INPUT
+    assert main(["sweep", "--out", str(tmp_path / "out"), "--device", "cpu", *shlex.split(options)]) == BAD_INPUT
     assert said in capsys.readouterr().err
     assert not list(tmp_path.rglob("config.json"))
 
@@ -151,12 +170,19 @@ class Script:
         self._busy.append(job)
 
     def wait(self, seconds: float) -> list[Done]:
+        if not self._busy:
+            return []
         job = self._busy.popleft()
         outcomes = []
         for cell in job:
             said = self.answers.get(str(cell), []).pop(0) if self.answers.get(str(cell)) else "finished"
+            (cell.path).mkdir(parents=True, exist_ok=True)
+            (cell.path / "status.json").write_text(json.dumps({"phase": "training", "step": len(self.given)}))
             if said is None:
                 return [Done(job, (), "its process was killed (signal 9)")]
+            if said == "ends":
+                (cell.path / "status.json").write_text(json.dumps({"phase": "finished", "step": 9}))
+                continue
             if said == "saves":
                 (cell.path / "checkpoints").mkdir(parents=True, exist_ok=True)
                 (cell.path / "checkpoints" / f"step-{len(self.given):010d}.npz").touch()
@@ -214,6 +240,23 @@ def test_on_a_gpu_cells_share_a_job(tmp_path: Path):
     crew = Script("gpu", 2, {})
     Sweep(made).run(crew, Looker())
     assert crew.given == [tuple(made[:3]), tuple(made[3:])]
+
+
+def test_on_a_gpu_what_was_finished_or_not_begun_when_a_worker_was_lost_is_not_blamed(tmp_path: Path):
+    made = cells(tmp_path, 3)
+    answers = {str(made[0]): ["ends"], str(made[1]): [None, "saves", None, "saves", "finished"]}
+    sweep = Sweep(made)
+    sweep.run(Script("gpu", 1, answers), Looker())
+    assert sweep.finished == set(made) and not sweep.failed
+
+
+def test_a_cell_that_another_process_trains_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made, looker = cells(tmp_path, 1), Looker()
+    clock = count(step=10)
+    monkeypatch.setattr("senior.sweep.scheduler.time.monotonic", lambda: float(next(clock)))
+    sweep = Sweep(made)
+    sweep.run(Script("cpu", 1, {str(made[0]): [f"The run {HELD}."] * 9}), looker)
+    assert sweep.finished == set(made) and len(looker.said) == 1 and "is waited for" in looker.said[0]
 
 
 def test_told_to_stop_it_gives_nothing_more_and_keeps_what_was_stopped_waiting(tmp_path: Path):
@@ -370,6 +413,47 @@ def test_a_cell_that_cannot_be_trained_is_named_and_the_others_go_on(
         sweep = run(made, tmp_path, board, jobs=1)
     assert sweep.finished == {made[0]}
     assert "motor burnt" in sweep.failed[made[1]]
+
+
+def test_a_dead_worker_is_found_though_something_that_it_started_lives_on(tmp_path: Path):
+    """What a worker forks holds its end of the pipe."""
+    crew = LocalCrew("cpu", 1, tmp_path / "logs")
+    config = short(device="cpu", env="tests.test_sweep:Forking", position="0:2")
+    crew.give((Cell(config, tmp_path / "run"),))
+    os.kill(worker_of(tmp_path / "run", 10), signal.SIGKILL)
+    until = time.monotonic() + 60
+    while not (done := crew.wait(0.5)):
+        assert time.monotonic() < until
+    assert done[0].outcomes == () and "signal 9" in done[0].reason
+    crew.close()
+
+
+class Forking(Point):
+    """A point with a helper, which outlives it for two minutes."""
+
+    def __init__(self) -> None:
+        super().__init__(50)
+        if "FORKED" not in os.environ:
+            os.environ["FORKED"] = "1"
+            if os.fork() == 0:
+                time.sleep(120)
+                os._exit(0)
+
+
+def test_one_cell_of_a_job_that_cannot_be_opened_leaves_the_others_alone(undisturbed: Path, tmp_path: Path):
+    mine, other = tmp_path / "mine", tmp_path / "other"
+    shutil.copytree(undisturbed / "seed-1", other)
+    held = RunDirectory(other)
+    held.lock()
+    job = (Cell(short(device="cpu", seed=1), other), Cell(short(device="cpu"), mine))
+    try:
+        first, second = train(job, Watch())
+    finally:
+        held.close()
+    assert not first.finished and first.failure is not None and HELD in first.failure
+    assert second.finished and second.failure is None
+    (again,) = train(job[:1], Watch())
+    assert again.finished, "its lock was let go of"
 
 
 def test_cells_that_hold_something_else_are_refused(tmp_path: Path):

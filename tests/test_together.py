@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from senior import learner, parts, program, together
+from senior import fit, learner, parts, together
 from senior.checkpoint import steps
 from senior.config import Config
 from senior.learner import Learner
@@ -162,7 +162,7 @@ def test_traced_functions_read_nothing_that_a_shape_leaves_out(config: Config, m
 
     read: set[str] = set()
     seen: Any = Spied(config, read)
-    spec = program.spec_of(config)
+    spec = fit.spec_of(config)
     monkeypatch.setattr(learner, "shape", lambda config: config if isinstance(config, Spied) else Spied(config, read))
     trace(Learner(seen, spec, parts.bonus(seen, spec)), config)
     expected = {"sac.batch", "networks.width", "queries.segment", "networks.layer_norm", "method.explore", "precision"}

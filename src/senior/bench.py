@@ -24,6 +24,7 @@ import numpy as np
 from senior import program, rundir, session
 from senior.checks import check
 from senior.config import Config, Pretraining
+from senior.fit import spec_of
 from senior.learner import Learner
 from senior.loop import Training
 from senior.methods import METHODS
@@ -122,7 +123,7 @@ def measure(config: Config, runs: int, device: str, length: int, out: Path, pool
     learns = config.method.learns_reward
     start = max(config.pretraining.until, config.pretraining.random_steps) + WARM_UP
     began = time.perf_counter()
-    spec = program.spec_of(config)
+    spec = spec_of(config)
     learner = program.make_learner(config, spec)
     trainees = [
         Trainee(replace(config, seed=i), out / f"seed-{i}", learner, spec, pools.worker(learner)) for i in range(runs)
@@ -216,7 +217,7 @@ def run(
     names = list(METHODS) if method == "all" else [method]
     configs = [replace(preset(preset_name, task, name), precision=precision) for name in names]
     device = prepare_device(device)
-    machine = _machine(program.spec_of(configs[0]), device)
+    machine = _machine(spec_of(configs[0]), device)
     print(
         f"{machine['device']}, {machine['threads']} threads, {machine['machine']}; {task}, {preset_name}, {precision}"
     )
@@ -255,7 +256,7 @@ def run_environments(task: str, count: int, json_file: Path | None) -> None:
     if json_file:
         rundir.make_room(json_file)
     figures = bench_environments.run(task, count)
-    _keep(json_file, {"machine": _machine(program.spec_of(preset("paper", task, "sac")), "cpu"), "figures": figures})
+    _keep(json_file, {"machine": _machine(spec_of(preset("paper", task, "sac")), "cpu"), "figures": figures})
 
 
 def _machine(spec: EnvSpec, device: str) -> dict[str, Any]:

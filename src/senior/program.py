@@ -8,16 +8,16 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 
-from senior import labels, parts, rundir
-from senior.checks import check
+from senior import parts, rundir
 from senior.config import Config, load
+from senior.fit import check_fit, check_offered, spec_of
 from senior.label.serving import Address, check_installed
 from senior.learner import Learner
 from senior.loop import Watcher
 from senior.runs import Lift, prepare_device
 from senior.shape import shape
 from senior.together import Pools, Result, Waiting, train_waiting, unopened
-from senior.trainee import Trainee, make_environment
+from senior.trainee import Trainee
 from senior.types import BadInput, EnvSpec
 
 HERE = Address()
@@ -64,7 +64,6 @@ def train_all(
     workers: int | None = None,
     runs_per_device: int | None = None,
     page: Address = HERE,
-    go_on: bool = False,
 ) -> list[Result]:
     """Train runs of any configurations, each in its directory, on one device.
 
@@ -78,59 +77,95 @@ def train_all(
         but not more than runs, and 0 on a CPU.
     runs_per_device: how many are trained at a time; None: as many as the memory holds.
     page: where people, if they are the teacher, are asked; what each run's page is opened by is told to ``watcher``.
-    go_on: whether a run that is there already, begun with the same configuration, goes on from its newest checkpoint.
 
     Returns one `Result` per run, in order; where there are several, one that cannot be opened is told in its own.
     Raises `BadInput` before anything is written if a configuration makes no sense, an environment does not fit, or a
-    directory is not empty or, with ``go_on``, holds another run.
+    directory is not empty.
     """
+    device = _check_runs(runs, workers, runs_per_device)
+    watcher = watcher or Quiet()
+    with Pools(workers, device, len(runs)) as pools:
+        trainees: list[Trainee] = []
+        try:
+            for config, path in runs:
+                trainees.append(_trainee(config, path, device, pools))
+            for trainee in trainees:
+                trainee.directory.check_free()
+                if not trainee.filmed:
+                    trainee.reset(0)
+            for trainee in trainees:
+                trainee.directory.create(trainee.config, rundir.protocol(trainee.spec, device))
+                if trainee.filmed:  # into that directory
+                    trainee.reset(0)
+        except BaseException:
+            _close(trainees)
+            raise
+        waiting = [Waiting(trainee, trainee.begin) for trainee in trainees]
+        return train_waiting(waiting, watcher, lift, runs_per_device, len(runs) == 1, page)
+
+
+def continue_all(runs: Sequence[tuple[Config, Path]], watcher: Watcher) -> list[Result]:
+    """`train_all`, but a run that is there goes on from its newest checkpoint, and a run that cannot be opened, or is
+    another one, is told in its own result: the others go on. ``senior sweep`` stands on it."""
+    device = _check_runs(runs, None, None)
+    results: dict[Path, Result] = {}
+    with Pools(None, device, len(runs)) as pools:
+        waiting: list[Waiting] = []
+        for config, path in runs:
+            trainee = None
+            try:
+                trainee = _trainee(config, path, device, pools)
+                waiting.append(_opened(trainee, device, watcher))
+            except BadInput as error:
+                _close([trainee] if trainee else [])
+                results[path] = unopened(path, error, watcher)
+        found = train_waiting(waiting, watcher, None, None, False, HERE)
+        results |= {one.path: one for one in found}
+    return [results[path] for _, path in runs]
+
+
+def _opened(trainee: Trainee, device: str, watcher: Watcher) -> Waiting:
+    """A run that is there, or a new one."""
+    directory = trainee.directory
+    if (directory.path / "config.json").is_file():
+        directory.check_holds(trainee.config)
+        with rundir.told(directory.path):
+            directory.lock()
+        _compare_protocol(trainee, device, watcher)
+        return Waiting(trainee, partial(trainee.resume, watcher.say))
+    directory.check_free()
+    trainee.reset(0)
+    directory.create(trainee.config, rundir.protocol(trainee.spec, device))
+    return Waiting(trainee, trainee.begin)
+
+
+def _check_runs(runs: Sequence[tuple[Config, Path]], workers: int | None, runs_per_device: int | None) -> str:
+    """`BadInput` for runs that make no sense; the device that they are computed on."""
     if not runs:
         raise BadInput("There is no run to train.")
     _check_machine(workers, runs_per_device)
     for config, _ in runs:
-        check(config)
-        if config.precision != "float32":  # `senior bench` may measure it
-            raise BadInput(
-                f"--precision {config.precision} is not offered: its learning curves do not agree well enough with "
-                "float32's (results/precision)."
-            )
+        check_offered(config)
         if config.teacher == "human":
             check_installed()
     if len({config.device for config, _ in runs}) > 1:
         raise BadInput("All runs of a program are on one device, so their --device must be the same.")
     if len({path.resolve() for _, path in runs}) < len(runs):
         raise BadInput("Every run needs a directory of its own.")
-    watcher = watcher or Quiet()
-    device = prepare_device(runs[0][0].device)
-    with Pools(workers, device, len(runs)) as pools:
-        begun, fresh = [], []
-        waiting: list[Waiting] = []
-        for config, path in runs:
-            own = replace(parts.resolved(config), device=device)
-            spec = spec_of(own)
-            _check_fit(own, spec)
-            learner = make_learner(own, spec)
-            trainee = Trainee(own, path, learner, spec, pools.worker(learner))
-            if go_on and (path / "config.json").is_file():
-                begun.append(trainee)
-                waiting.append(Waiting(trainee, partial(trainee.resume, watcher.say)))
-            else:
-                fresh.append(trainee)
-                waiting.append(Waiting(trainee, trainee.begin))
-        for trainee in begun:
-            trainee.directory.check_holds(trainee.config)
-            with rundir.told(trainee.directory.path):
-                trainee.directory.lock()
-            _compare_protocol(trainee, device, watcher)
-        for trainee in fresh:
-            trainee.directory.check_free()
-            if not trainee.filmed:
-                trainee.reset(0)
-        for trainee in fresh:
-            trainee.directory.create(trainee.config, rundir.protocol(trainee.spec, device))
-            if trainee.filmed:  # into that directory
-                trainee.reset(0)
-        return train_waiting(waiting, watcher, lift, runs_per_device, len(runs) == 1, page)
+    return prepare_device(runs[0][0].device)
+
+
+def _trainee(config: Config, path: Path, device: str, pools: Pools) -> Trainee:
+    own = replace(parts.resolved(config), device=device)
+    spec = spec_of(own)
+    check_fit(own, spec)
+    learner = make_learner(own, spec)
+    return Trainee(own, path, learner, spec, pools.worker(learner))
+
+
+def _close(trainees: Sequence[Trainee]) -> None:
+    for trainee in trainees:
+        trainee.close()
 
 
 def _check_machine(workers: int | None, runs_per_device: int | None) -> None:
@@ -138,27 +173,6 @@ def _check_machine(workers: int | None, runs_per_device: int | None) -> None:
         raise BadInput(f"--workers {workers} must be between 0 and 1024.")
     if runs_per_device is not None and runs_per_device < 1:
         raise BadInput(f"--runs-per-device {runs_per_device} must be at least 1.")
-
-
-def _check_fit(config: Config, spec: EnvSpec) -> None:
-    """Refuse what does not fit into an environment's episodes."""
-    if config.method.learns_reward and spec.horizon <= config.queries.segment:
-        raise BadInput(
-            f"A segment of {config.queries.segment} steps does not fit into an episode of {spec.horizon}; "
-            "lower --segment."
-        )
-    if parts.is_recorded(config):
-        held = labels.pairs_in(Path(config.teacher), (config.queries.segment, spec.observation_size, spec.action_size))
-        if held < config.queries.budget:
-            raise BadInput(
-                f"{config.teacher} holds {held} answered pairs, fewer than the budget of {config.queries.budget}; give "
-                f"--budget {held} or less."
-            )
-    if config.capacity < min(spec.horizon, config.steps):
-        raise BadInput(
-            f"A replay of {config.capacity} rows cannot hold an episode of {spec.horizon} steps; raise "
-            "--replay-capacity."
-        )
 
 
 def resume(
@@ -212,13 +226,6 @@ def find_runs(path: Path | str) -> list[Path]:
     if not found:
         raise BadInput(f"There is no run in {path}: no config.json of a run at or below it.")
     return found
-
-
-def spec_of(config: Config) -> EnvSpec:
-    """What there is to know of a configuration's environment; looks at it once."""
-    environment, spec = make_environment(config)
-    environment.close()
-    return spec
 
 
 def make_learner(config: Config, spec: EnvSpec | None = None) -> Learner:

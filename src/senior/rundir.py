@@ -76,6 +76,8 @@ TIMING = (
     "checkpoint",
 )
 TABLES = {"eval.csv": EVAL, "train.csv": TRAIN, "timing.csv": TIMING}
+HELD = "is being trained by another process"
+"""Said of a run whose lock another process holds."""
 PACKAGES = ("senior-rl", "jax", "jaxlib", "optax", "numpy", "gymnasium", "metaworld", "mujoco")
 
 
@@ -125,7 +127,7 @@ class RunDirectory:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.close()
-            raise BadInput(f"The run in {self.path} is being trained by another process.") from None
+            raise BadInput(f"The run in {self.path} {HELD}.") from None
         except OSError:  # a file system without locks
             pass
 

@@ -52,7 +52,7 @@ def sweep(arguments: Sequence[str]) -> int:
     if "-h" in arguments:
         mine = ["--help"]
     options = parse(SweepOptions, mine, None, "sweep")
-    axes = {**(grid.read(options.file) if options.file else {}), **given}
+    axes = grid.merged(grid.read(options.file), given) if options.file else given
     cells = grid.cells_of(axes, options.out)
     check_cells(cells)
     if options.list:
@@ -136,9 +136,11 @@ class ReproduceOptions:
 
 def reproduce(arguments: list[str]) -> int:
     options = parse(ReproduceOptions, arguments, None, "reproduce")
+    from senior.report.build import check_installed
     from senior.reproduce import run
     from senior.reproduce.studies import SEEDS
 
+    check_installed()
     seeds = SEEDS[options.scale] if options.seeds is None else options.seeds
     if seeds < 1:
         raise BadInput(f"--seeds must be at least 1, not {seeds}.")
@@ -149,8 +151,7 @@ def reproduce(arguments: list[str]) -> int:
         cells = run.cells(studies.values(), range(seeds), options.scale, out)
         code = run_cells(cells, out, options.jobs, options.ray)
     if code != INTERRUPTED:
-        built, summary = run.write(studies, options.scale, out)
-        print(f"{summary}\n{built.page}")
+        print(run.write(studies, options.scale, out))
     return code
 
 
@@ -166,6 +167,8 @@ class ReportOptions:
 
 def report(arguments: list[str]) -> int:
     options = parse(ReportOptions, arguments, None, "report")
+    if not options.runs:
+        raise BadInput("Name at least one run, or a directory that holds some.")
     from senior.report.build import report
 
     built = report(options.runs, options.out)
@@ -193,6 +196,8 @@ class WatchOptions:
 
 def watch(arguments: list[str]) -> int:
     options = parse(WatchOptions, arguments, None, "watch")
+    if not options.runs:
+        raise BadInput("Name at least one run, or a directory that holds some, or will.")
     try:
         from senior.report.watch import serve
     except ImportError as error:

@@ -26,6 +26,15 @@ class Built(NamedTuple):
     """Runs, and files of runs, that are not, with the reason."""
 
 
+def check_installed() -> None:
+    """`BadInput` if what a report needs is not there."""
+    missing = [name for name in ("jinja2", "rliable") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise BadInput(
+            f"A report needs {' and '.join(missing)}, which is not installed: pip install 'senior-rl[report]'"
+        )
+
+
 def report(places: Sequence[Path], out: Path, first: Sequence[Section] = (), unfinished: bool = False) -> Built:
     """Read all runs at or below ``places`` and write the page, its figures and tables into ``out``.
 
@@ -35,11 +44,7 @@ def report(places: Sequence[Path], out: Path, first: Sequence[Section] = (), unf
     Raises `BadInput` if there is no run with an evaluation, if ``out`` cannot be written, or if what draws the page is
     not installed.
     """
-    missing = [name for name in ("jinja2", "rliable") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise BadInput(
-            f"A report needs {' and '.join(missing)}, which is not installed: pip install 'senior-rl[report]'"
-        )
+    check_installed()
     results = read(places, unfinished)
     if not results.runs:
         raise BadInput(_nothing(places, results))

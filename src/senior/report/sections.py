@@ -79,7 +79,7 @@ def summary(tasks: Tasks, shared: Sequence[str] = ()) -> Section:
         "over all asked pairs."
     ]
     if shared:
-        text.append(f"All arms have, beside what their names tell: {' '.join(shared)}.")
+        text.append(f"All arms that ask people have, beside what their names tell: {' '.join(shared)}.")
     short = sorted({run.steps for run in runs if run.steps < PAPER[1]})
     if short:
         text.append(

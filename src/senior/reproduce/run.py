@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from senior.report.build import Built, report
+from senior.config import Config, differences
+from senior.report.build import report
+from senior.report.names import normal
 from senior.report.results import Run, read
 from senior.reproduce import page
 from senior.reproduce.studies import Arm, Scale, Study, Table, chosen, configuration
@@ -43,22 +46,48 @@ def cells(studies: Iterable[Study], seeds: Sequence[int], scale: Scale, out: Pat
     return list(found.values())
 
 
-def runs_by_arm(studies: Iterable[Study], scale: Scale, out: Path) -> dict[tuple[str, str], list[Run]]:
-    """Finished runs below ``out`` by arm and task."""
+def runs_by_arm(
+    studies: Iterable[Study], scale: Scale, out: Path
+) -> tuple[dict[tuple[str, str], list[Run]], list[str]]:
+    """Finished runs below ``out`` by arm and task, and in sentences what is there and does not count.
+
+    Runs count that were trained with the configuration of that arm, task and scale, and of those the most that agree in
+    all that a number depends on (`senior.report.results.Arm`).
+    """
     there: dict[Path, list[Run]] = {}
     for run in read([out]).runs:
         there.setdefault(run.path.parent, []).append(run)
-    return {
-        (arm.name, task): there[place]
-        for study in studies
-        for task in study.tasks
-        for arm in study.arms
-        if (place := folder(out, arm, task, scale)) in there
-    }
+    found: dict[tuple[str, str], list[Run]] = {}
+    refused: dict[str, list[Path]] = {}
+    for study in studies:
+        for task in study.tasks:
+            for arm in study.arms:
+                alike: dict[object, list[Run]] = {}
+                for run in there.get(folder(out, arm, task, scale), []):
+                    wanted = configuration(arm, task, run.seed, scale)
+                    if run.config is None or differences(_comparable(run.config), _comparable(wanted)):
+                        refused.setdefault(f"no run of its arm at the scale {scale}", []).append(run.path)
+                    else:
+                        alike.setdefault(run.arm.fingerprint, []).append(run)
+                most = max(alike.values(), key=len, default=[])
+                for run in (run for own in alike.values() if own is not most for run in own):
+                    refused.setdefault("a protocol that most runs beside it do not have", []).append(run.path)
+                if most:
+                    found[arm.name, task] = most
+    return found, [
+        f"Not judged: {paths[0]}{f' and {len(paths) - 1} more' if len(paths) > 1 else ''}: {reason}."
+        for reason, paths in refused.items()
+    ]
 
 
-def write(studies: dict[Table, Study], scale: Scale, out: Path) -> tuple[Built, str]:
-    """The page of what is finished below ``out``, in ``out/report``; and its verdicts in lines for a terminal."""
-    runs = runs_by_arm(studies.values(), scale, out)
-    first = page.sections(list(studies), studies, scale, runs)
-    return report([out], out / "report", first), page.summary(list(studies), studies, scale, runs)
+def _comparable(config: Config) -> Config:
+    """With a teacher's numbers, and without what no number depends on."""
+    return replace(normal(config), device="auto", checkpoint_every=1, snapshot_every=1)
+
+
+def write(studies: dict[Table, Study], scale: Scale, out: Path) -> str:
+    """The page of what is finished below ``out``, in ``out/report``; returns its verdicts in lines for a terminal."""
+    runs, refused = runs_by_arm(studies.values(), scale, out)
+    judged = page.judge(list(studies), studies, runs)
+    built = report([out], out / "report", page.sections(judged, scale, refused))
+    return "\n".join([page.summary(judged, scale), *refused, str(built.page)])

@@ -1,7 +1,9 @@
 """The studies of the SENIOR paper (Section V) as data: what is trained, what it reports, what it says.
 
 Its main table gives numbers, ``MAIN``. Its figures give none, so there its sentences are what can be tested,
-``CLAIMS``: in our words, with the place where the paper has them.
+``CLAIMS``: in our words, with the place where the paper has them. Not among them: that PGE comes to explore around the
+lock within 200,000 steps and RUNE does not (Fig. 8), which the report's maps show and no number decides; and that other
+methods do not always improve with more answers, which names neither methods nor budgets.
 """
 
 from __future__ import annotations
@@ -16,6 +18,8 @@ from senior.sweep.grid import configured
 
 Scale = Literal["paper", "quick", "smoke"]
 Table = Literal["main", "feedback", "ablation", "quality"]
+When = Literal["half", "end", "curve"]
+"""After half of the steps, at the end, or over the whole curve."""
 
 TASKS = ("door-lock", "window-close", "handle-press", "window-open", "door-open", "door-unlock")
 BASELINES = ("pebble", "mrn", "rune", "m-rune", "qpa")
@@ -110,7 +114,7 @@ class Quantity:
 
     arm: str
     tasks: tuple[str, ...]
-    when: Literal["half", "end", "curve"] = "end"
+    when: When = "end"
 
 
 @dataclass(frozen=True)
@@ -132,36 +136,53 @@ class Claim:
     comparisons: tuple[Comparison, ...]
 
 
-def _above(arm: str, others: tuple[str, ...], tasks: tuple[str, ...], when: Literal["half", "end", "curve"] = "end"):
+def _above(arm: str, others: tuple[str, ...], tasks: tuple[str, ...], when: When = "end") -> tuple[Comparison, ...]:
     """On every task by itself."""
     return tuple(
         Comparison(Quantity(arm, (task,), when), Quantity(other, (task,), when)) for task in tasks for other in others
     )
 
 
-FOUR_TIMES = tuple(
-    # 250 answers, and others with a thousand are not more than ten points ahead
-    Comparison(Quantity("m-senior-250", (task,)), Quantity(f"{other}-1000", (task,)), -0.1)
-    for task in ("door-lock", "window-open")
-    for other in BASELINES
-)
+BUDGET_TASKS = ("door-lock", "window-open")
+AS_WELL = -0.1
+"""A difference that still is "as well": ten points less."""
+MUCH = 0.1
+"""And one that is "much": ten points more."""
 
 CLAIMS: tuple[Claim, ...] = (
     Claim(
         "main",
-        "On every task P-SENIOR and M-SENIOR end with more success than the five other methods.",
+        "On every task M-SENIOR ends with more success than the five other methods.",
         "V.C, Fig. 4",
-        _above("m-senior", BASELINES, TASKS) + _above("p-senior", BASELINES, TASKS),
+        _above("m-senior", BASELINES, TASKS),
     ),
     Claim(
         "main",
-        "On every task they converge faster: there is more success below their whole curves.",
+        "On every task M-SENIOR converges faster: there is more success below its whole curve.",
         "V.C, Fig. 4",
-        _above("m-senior", BASELINES, TASKS, "curve") + _above("p-senior", BASELINES, TASKS, "curve"),
+        _above("m-senior", BASELINES, TASKS, "curve"),
     ),
     Claim(
         "main",
-        "On average M-SENIOR has more success after half of the steps than any other method at the end.",
+        "P-SENIOR ends above the five other methods in most cases; tested on average over the tasks.",
+        "V.C",
+        tuple(Comparison(Quantity("p-senior", TASKS), Quantity(other, TASKS)) for other in BASELINES),
+    ),
+    Claim(
+        "main",
+        "P-SENIOR ends below M-SENIOR on average.",
+        "V.C",
+        (Comparison(Quantity("m-senior", TASKS), Quantity("p-senior", TASKS)),),
+    ),
+    Claim(
+        "main",
+        "After half of the steps M-SENIOR is far above the five other methods on average.",
+        "V.C; far: more than 10 points",
+        tuple(Comparison(Quantity("m-senior", TASKS, "half"), Quantity(o, TASKS, "half"), MUCH) for o in BASELINES),
+    ),
+    Claim(
+        "main",
+        "On average M-SENIOR has more success after half of the steps than the five other methods at the end.",
         "V.C",
         tuple(Comparison(Quantity("m-senior", TASKS, "half"), Quantity(other, TASKS)) for other in BASELINES),
     ),
@@ -192,16 +213,25 @@ CLAIMS: tuple[Claim, ...] = (
         "V.C, Fig. 5",
         tuple(
             Comparison(Quantity(f"m-senior-{budget}", (task,)), Quantity(f"{other}-{budget}", (task,)))
-            for task in ("door-lock", "window-open")
+            for task in BUDGET_TASKS
             for budget in BUDGETS
             for other in BASELINES
         ),
     ),
     Claim(
         "feedback",
-        "It is at least four times as feedback-efficient: with 250 answers it does as well as others with 1,000.",
+        "It is at least four times as feedback-efficient: with 250 answers it does as well as others with 1,000, and "
+        "much better than they with 500.",
         "V.C; as well: not more than 10 points lower",
-        FOUR_TIMES,
+        tuple(
+            comparison
+            for task in BUDGET_TASKS
+            for other in BASELINES
+            for comparison in (
+                Comparison(Quantity("m-senior-250", (task,)), Quantity(f"{other}-1000", (task,)), AS_WELL),
+                Comparison(Quantity("m-senior-250", (task,)), Quantity(f"{other}-500", (task,)), MUCH),
+            )
+        ),
     ),
     Claim(
         "feedback",
@@ -211,11 +241,14 @@ CLAIMS: tuple[Claim, ...] = (
     ),
     Claim(
         "feedback",
-        "M-SENIOR gets better with every larger budget.",
-        "V.C",
+        "M-SENIOR does not get worse with any larger budget, and is better with 1,000 answers than with 150.",
+        "V.C (improves continuously); worse: more than 10 points lower",
         tuple(
-            Comparison(Quantity(f"m-senior-{more}", (task,)), Quantity(f"m-senior-{less}", (task,)))
-            for task in ("door-lock", "window-open")
+            Comparison(Quantity("m-senior-1000", (task,)), Quantity("m-senior-150", (task,))) for task in BUDGET_TASKS
+        )
+        + tuple(
+            Comparison(Quantity(f"m-senior-{more}", (task,)), Quantity(f"m-senior-{less}", (task,)), AS_WELL)
+            for task in BUDGET_TASKS
             for less, more in pairwise(BUDGETS)
         ),
     ),
@@ -241,9 +274,12 @@ CLAIMS: tuple[Claim, ...] = (
     Claim(
         "quality",
         "A tenth of wrong answers makes both MDS and QPA much worse.",
-        "V.D, Fig. 7",
-        _above(WITHOUT_PGE.name, ("mds-fn",), ("door-lock", "handle-press"))
-        + _above("qpa", ("qpa-fn",), ("door-lock", "handle-press")),
+        "V.D, Fig. 7; much: more than 10 points",
+        tuple(
+            Comparison(Quantity(arm, (task,)), Quantity(noisy, (task,)), MUCH)
+            for arm, noisy in ((WITHOUT_PGE.name, "mds-fn"), ("qpa", "qpa-fn"))
+            for task in ("door-lock", "handle-press")
+        ),
     ),
     Claim(
         "quality",
@@ -287,22 +323,22 @@ def _smoke(config: Config) -> Config:
     share = config.queries.budget / 250  # budgets stay different
     config = replace(
         config,
-        steps=800,
+        steps=600,
         horizon=100,
         networks=Networks(layers=1, width=16, reward_layers=1, reward_width=16),
         sac=replace(config.sac, batch=32, updates=1, reset_updates=10),
         reward=replace(config.reward, epochs=5, batch=16),
-        bilevel=replace(config.bilevel, every=200),
+        bilevel=replace(config.bilevel, every=100),
         pge=replace(config.pge, capacity=100, every=100),
-        evaluation=Evaluation(every=200, episodes=2),
-        checkpoint_every=400,
-        snapshot_every=200,
+        evaluation=Evaluation(every=300, episodes=2),
+        checkpoint_every=300,
+        snapshot_every=300,
     )
     if not config.method.learns_reward:
         return replace(config, pretraining=Pretraining(random_steps=100, until=0))
     return replace(
         config,
-        pretraining=Pretraining(random_steps=100, until=300),
+        pretraining=Pretraining(random_steps=100, until=200),
         queries=replace(
             config.queries, budget=max(3, round(12 * share)), per_session=max(1, round(4 * share)), every=100
         ),

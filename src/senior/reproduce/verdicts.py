@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 
 from senior.report.results import Run
 from senior.report.statistics import Group, Interval, contrast, mean_over
-from senior.reproduce.studies import Claim, Comparison, Quantity
+from senior.reproduce.studies import Claim, Comparison, Quantity, When
 
 TOLERANCE = 0.1
 """How far from the paper's figure a mean may be."""
@@ -24,7 +24,6 @@ MOST_SEEDS = 1000
 """Up to how many it is told how many would decide."""
 
 Decided = Literal["yes", "no", "open", "missing"]
-When = Literal["half", "end", "curve"]
 Runs = Mapping[tuple[str, str], Sequence[Run]]
 """Finished runs by arm and task."""
 
@@ -39,6 +38,8 @@ class Verdict(NamedTuple):
     verdict: Literal["reproduced", "not reproduced", "undecided", "missing"]
     needed: int | None
     """Seeds that would decide, if it is undecided and `MOST_SEEDS` are enough."""
+    hours: float | None
+    """Of wall time that all of its runs took; None: not told by one."""
 
 
 class Judged(NamedTuple):
@@ -58,13 +59,14 @@ def judge_number(paper: float, runs: Runs, arm: str, tasks: Sequence[str], when:
     """The paper's success rate of an arm, in [0, 1], beside ours; with several tasks, of their average."""
     groups = _groups(Quantity(arm, tuple(tasks), when), runs, 1.0)
     if groups is None:
-        return Verdict(paper, None, 0, "missing", None)
+        return Verdict(paper, None, 0, "missing", None, None)
     seeds = min(len(group.rates) for group in groups)
     ours = contrast(groups, CONFIDENCE)
     decided = _decide(ours, paper)
-    if decided != "undecided":
-        return Verdict(paper, ours, seeds, decided, None)
-    return Verdict(paper, ours, seeds, decided, _seeds_that_decide(groups, paper))
+    needed = _seeds_that_decide(groups, paper) if decided == "undecided" else None
+    seconds = [run.seconds for task in tasks for run in runs[arm, task]]
+    hours = None if None in seconds else sum(second or 0.0 for second in seconds) / 3600
+    return Verdict(paper, ours, seeds, decided, needed, hours)
 
 
 def _decide(ours: Interval, paper: float) -> Literal["reproduced", "not reproduced", "undecided"]:

@@ -72,14 +72,17 @@ class Board:
         return f"{counts}, {len(sweep.waiting)} waiting{failed}{left}"
 
     def _table(self, sweep: Sweep, line: str) -> Table:
-        """A row per directory of seeds."""
-        table = Table(caption=line, caption_justify="left", box=None, pad_edge=False)
+        """A row per directory of seeds, as many as the terminal has room for, those under way first."""
+        table = Table(title=line, title_justify="left", title_style="", box=None, pad_edge=False)
         for name in ("cells", "done", "running", "waiting", "failed", "labels", "success"):
             table.add_column(name, justify="left" if name == "cells" else "right", no_wrap=True)
         groups: dict[Path, list[Cell]] = {}
         for cell in sweep.cells:
             groups.setdefault(cell.path.parent, []).append(cell)
-        for folder, cells in groups.items():
+        room = max(1, self._console.height - 4)
+        stirring = [folder for folder, cells in groups.items() if set(cells) & sweep.running]
+        shown = [*stirring, *(folder for folder in groups if folder not in stirring)][:room]
+        for folder, cells in ((folder, cells) for folder, cells in groups.items() if folder in shown):
             told = [standing(cell.path) for cell in cells]
             success = [one["success"] for one in told if one.get("success") is not None]
             table.add_row(
@@ -88,6 +91,8 @@ class Board:
                 f"{sum(one.get('labels', 0) for one in told)}/{sum(_budget(cell) for cell in cells)}",
                 f"{sum(success) / len(success):.0%}" if success else "-",
             )
+        if len(shown) < len(groups):
+            table.add_row(f"and {len(groups) - len(shown)} more")
         return table
 
 

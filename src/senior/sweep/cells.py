@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from senior import parts
-from senior.checks import check
-from senior.config import Config, from_json, to_json
+from senior.config import Config, from_json, made_by, to_json
+from senior.fit import check_fit, check_offered, spec_of
 from senior.rundir import RunDirectory
-from senior.types import BadInput
+from senior.types import BadInput, EnvSpec
 
 
 @dataclass(frozen=True)
@@ -61,15 +61,20 @@ def check_cells(cells: Sequence[Cell]) -> None:
         raise BadInput(f"Two cells of the sweep would be in {twice}.")
     if len({cell.config.device for cell in cells}) > 1:
         raise BadInput("All cells of a sweep are on one kind of device, so their --device must be the same.")
+    specs: dict[str, EnvSpec] = {}
     for cell in cells:
-        check(cell.config)
+        check_offered(cell.config)
         if parts.takes_time(cell.config):
             raise BadInput(f"A sweep does not wait for people; the teacher of {cell} is {cell.config.teacher}.")
+        own = parts.resolved(cell.config)
+        environment = json.dumps(made_by(own))
+        if environment not in specs:
+            specs[environment] = spec_of(own)
+        check_fit(own, specs[environment])
         directory = RunDirectory(cell.path)
         if (cell.path / "config.json").is_file():
-            directory.check_holds(parts.resolved(cell.config))
+            directory.check_holds(own)
         else:
-            parts.resolved(cell.config)
             directory.check_free()
 
 
@@ -80,6 +85,14 @@ def standing(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return told if isinstance(told, dict) else {}
+
+
+def opened_at(path: Path) -> int:
+    """When a run last said anything, in nanoseconds; 0: it never did."""
+    try:
+        return (path / "status.json").stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def is_finished(path: Path) -> bool:

@@ -13,6 +13,7 @@ import platform
 import socket
 import time
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +38,17 @@ class Hand:
         self._marker = Path(marker)
         take_cores(threads)
 
-    def device(self, wanted: str) -> str:
-        """cpu or gpu, or a sentence that says why there is none."""
-        from senior.runs import prepare_device  # starts JAX
+    def begin(self, wanted: str) -> str:
+        """Start JAX; a sentence if this is no place for a sweep, else nothing."""
+        if os.environ.get("RAY_AUTH_MODE") != "token":
+            return "The Ray cluster does not ask for a token: start it with RAY_AUTH_MODE=token (docs/experiments.md)."
+        from senior.runs import prepare_device
 
         try:
-            return prepare_device(wanted)
+            prepare_device(wanted)
         except BadInput as error:
             return str(error)
+        return ""
 
     def work(self, job: str) -> str:
         """An `order` done; its `report`."""
@@ -60,48 +64,57 @@ class Hand:
 
 
 class RayCrew:
-    """So many actors at a time. One that is lost is replaced when there is work for it."""
+    """So many actors, as far as the cluster has room for them. One that is lost is replaced when there is room."""
 
-    def __init__(self, address: str, device: str, jobs: int | None, out: Path) -> None:
-        """Raises `BadInput` if Ray is not installed, the cluster cannot be used, or does not see ``out``."""
+    def __init__(self, address: str, device: str, jobs: int | None, out: Path, say: Callable[[str], None]) -> None:
+        """jobs: actors; None: one per processor or, where there are GPUs and not only the CPU is asked for, per GPU.
+
+        Raises `BadInput` if Ray is not installed or the cluster cannot be used.
+        """
         self._ray = _connect(address)
+        self._wanted, self._say = device, say
         self._marker = out.resolve() / f"sweep-{uuid.uuid4().hex}"
         self._marker.touch()
-        gpus = int(self._ray.cluster_resources().get("GPU", 0)) if device != "cpu" else 0
-        cpus = int(self._ray.cluster_resources().get("CPU", 0))
-        self.size = jobs or gpus or cpus
-        if self.size < 1:
-            raise BadInput(f"The Ray cluster at {address} has no processors to give.")
-        self._options = {"num_cpus": max(1, cpus // gpus), "num_gpus": 1} if gpus else {"num_cpus": 1, "num_gpus": 0}
-        self._hands: list[Any] = []
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        with_gpu = [node for node in nodes if node.get("GPU", 0) >= 1 and device != "cpu"]
+        gpus = int(sum(node["GPU"] for node in with_gpu))
+        self.device = "gpu" if gpus else "cpu"
+        self.size = jobs or gpus or int(sum(node.get("CPU", 0) for node in nodes))
+        self._cpus = max(1, min((int(node.get("CPU", 1) // node["GPU"]) for node in with_gpu), default=1))
+        self._ready: list[Any] = []
+        self._placing: dict[Any, Any] = {}
         self._jobs: dict[Any, tuple[Any, Job]] = {}
-        first = self._hire()
-        self.device = self._ray.get(first.device.remote(device))
-        if self.device not in ("cpu", "gpu"):
-            raise BadInput(self.device)
+        self._asked, self._told = time.monotonic(), False
+        for _ in range(self.size):
+            self._hire()
 
     @property
     def idle(self) -> int:
-        """How many more jobs can be given."""
-        return self.size - len(self._jobs)
+        """How many more jobs can be given now: to actors that have a place."""
+        return len(self._ready)
 
     def give(self, job: Job) -> None:
         """Have a job done."""
-        busy = [hand for hand, _ in self._jobs.values()]
-        hand = next((hand for hand in self._hands if hand not in busy), None) or self._hire()
+        hand = self._ready.pop()
         self._jobs[hand.work.remote(order(job))] = hand, job
 
     def wait(self, seconds: float) -> list[Done]:
-        """The jobs that are done, after at most so long."""
-        if not self._jobs:
+        """The jobs that are done, after at most so long. Raises `BadInput` if the cluster is not fit for a sweep."""
+        under_way = [*self._jobs, *self._placing]
+        if not under_way:
             time.sleep(seconds)
             return []
-        ready, _ = self._ray.wait(list(self._jobs), timeout=seconds)
-        return [self._take(reference) for reference in ready]
+        over, _ = self._ray.wait(under_way, num_returns=len(under_way), timeout=seconds)
+        for placed in [one for one in over if one in self._placing]:
+            self._welcome(placed)
+        if not (self._ready or self._jobs or self._told) and time.monotonic() - self._asked > CONNECT_SECONDS:
+            self._told = True
+            self._say("The Ray cluster has no room yet; the sweep waits for it.")
+        return [self._take(one) for one in over if one in self._jobs]
 
     def stop(self) -> None:
         """Tell all actors to save what they do and leave."""
-        for hand in self._hands:
+        for hand, _ in self._jobs.values():
             hand.stop.remote()
 
     def close(self) -> None:
@@ -109,25 +122,40 @@ class RayCrew:
         self.stop()
         if self._jobs:
             self._ray.wait(list(self._jobs), num_returns=len(self._jobs), timeout=LEAVE_SECONDS)
-        for hand in self._hands:
+        for hand in [*self._ready, *self._placing.values(), *(hand for hand, _ in self._jobs.values())]:
             self._ray.kill(hand)
         self._ray.shutdown()
         self._marker.unlink(missing_ok=True)
 
-    def _hire(self) -> Any:
-        actor = self._ray.remote(Hand).options(max_concurrency=2, **self._options)
-        hand = actor.remote(self._options["num_cpus"], str(self._marker))
-        self._hands.append(hand)
-        return hand
+    def _hire(self) -> None:
+        """A new actor, which may have to wait for its place."""
+        resources = {"num_cpus": self._cpus, "num_gpus": int(self.device == "gpu")}
+        hand = self._ray.remote(Hand).options(max_concurrency=2, **resources).remote(self._cpus, str(self._marker))
+        self._placing[hand.begin.remote(self._wanted)] = hand
+
+    def _welcome(self, placed: Any) -> None:
+        hand = self._placing.pop(placed)
+        try:
+            refused = self._ray.get(placed)
+        except self._ray.exceptions.RayError as error:
+            refused = f"A worker on the Ray cluster cannot begin: {_first_line(error)}"
+        if refused:
+            raise BadInput(refused)
+        self._ready.append(hand)
 
     def _take(self, reference: Any) -> Done:
         hand, job = self._jobs.pop(reference)
         try:
-            return Done(job, outcomes_of(self._ray.get(reference)))
+            done = Done(job, outcomes_of(self._ray.get(reference)))
         except self._ray.exceptions.RayError as error:
-            self._hands.remove(hand)
-            first = str(error).strip().splitlines()[0]
-            return Done(job, (), f"its worker was lost ({type(error).__name__}: {first})")
+            self._hire()
+            return Done(job, (), f"its worker was lost ({type(error).__name__}: {_first_line(error)})")
+        self._ready.append(hand)
+        return done
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
 def _connect(address: str) -> Any:
@@ -148,7 +176,7 @@ def _connect(address: str) -> Any:
         name = f"senior-{uuid.uuid4().hex}"
         ray.init(address=address, namespace=name, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:  # whatever Ray raises: unreachable, wrong token, another version
-        reason = str(error).strip().splitlines()[0]
+        reason = _first_line(error)
         raise BadInput(f"The Ray cluster at {address} cannot be used, or has another token: {reason}") from error
     return ray
 

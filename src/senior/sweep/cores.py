@@ -1,7 +1,7 @@
 """A share of this machine's processors for each worker, so that each computes with equally many threads.
 
-A run's last bits depend on how many threads it was computed with (docs/design of the run directory: protocol).
-Workers of any sweep on a machine take processors that no other worker has, by locks that go with the process.
+A run's last bits depend on how many threads it was computed with, which its ``config.json`` tells. Workers of any sweep
+on a machine take processors that no other worker has, by locks that go with the process.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ except ImportError:  # Windows
     fcntl = None
 
 _held: list[int] = []
+"""Locks of this process."""
 
 
 def take_cores(count: int) -> None:
@@ -33,10 +34,16 @@ def take_cores(count: int) -> None:
 
 
 def _lock(core: int) -> bool:
+    """Hold a processor; False if another process does, or the folder of locks is not ours."""
     assert fcntl is not None
     folder = Path(tempfile.gettempdir()) / f"senior-cores-{os.getuid()}"
-    folder.mkdir(exist_ok=True)
-    file = os.open(folder / str(core), os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        if folder.stat(follow_symlinks=False).st_uid != os.getuid():
+            return False
+        file = os.open(folder / str(core), os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+    except OSError:
+        return False
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

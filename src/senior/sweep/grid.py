@@ -40,6 +40,7 @@ def split(arguments: Sequence[str], own: Sequence[str]) -> tuple[list[str], Grid
             values.append(argument)
             continue
         name, given, value = argument[2:].partition("=")
+        name = name.replace("_", "-")
         if name in own:
             values = mine
             mine.append(argument)
@@ -56,7 +57,8 @@ def read(file: Path) -> Grid:
     except (OSError, ValueError) as error:
         raise BadInput(f"{file} cannot be read: {error}.") from error
     grid: Grid = {}
-    for name, value in _flat(content, ""):
+    for key, value in _flat(content, ""):
+        name = key.replace("_", "-")
         values = value if isinstance(value, list) else [value]
         if any(isinstance(one, (list, dict)) for one in values):
             raise BadInput(f"{file}: {name} must be a value or a list of values.")
@@ -76,6 +78,16 @@ def _flat(content: Mapping[str, Any], prefix: str) -> list[tuple[str, Any]]:
     return found
 
 
+def merged(grid: Grid, over: Grid) -> Grid:
+    """A grid with the options of another in place of its own; --wait is one with --no-wait, --arm with --method."""
+    replaced = {_kind(name) for name in over}
+    return {**{name: values for name, values in grid.items() if _kind(name) not in replaced}, **over}
+
+
+def _kind(name: str) -> str:
+    return "arm" if name == "method" else name.removeprefix("no-") if name.removeprefix("no-") in FLAGS else name
+
+
 def cells_of(grid: Grid, out: Path) -> list[Cell]:
     """A cell for every choice of one value per option, in ``out/TASK/ARM/seed-N``.
 
@@ -88,6 +100,10 @@ def cells_of(grid: Grid, out: Path) -> list[Cell]:
         raise BadInput("Give --arm or --method, not both: an arm begins with its method.")
     axes["arm"] = axes.pop("arm", axes.pop("method", ["m-senior"]))
     axes.setdefault("task", ["door-lock"])
+    for arm in axes["arm"]:
+        own = {word[2:].partition("=")[0].replace("_", "-") for word in arm.split() if word.startswith("--")}
+        for name in sorted(own & {*axes, "task", "seed"}):
+            raise BadInput(f"The arm {arm!r} has a --{name} of its own, and so has the sweep.")
     axes = {"seed": axes.pop("seed", ["0"]), **axes}  # the first seed of every arm comes before the second of any
     varied = [name for name, values in axes.items() if len(values) > 1 and name not in ("arm", "task", "seed", "env")]
     cells = []

@@ -37,9 +37,9 @@ class LocalCrew:
 
         Raises `BadInput` if there is no such device.
         """
-        if jobs is not None and not 1 <= jobs <= 1024:
-            raise BadInput(f"--jobs {jobs} must be between 1 and 1024.")
         self.device = find_device(device)
+        if self.device == "gpu" and (jobs or 1) > 1:
+            raise BadInput(f"--jobs {jobs}: a GPU has one worker, which trains as many runs at a time as it holds.")
         self.size = jobs or (1 if self.device == "gpu" else threads())
         self._threads = max(1, threads() // self.size)
         self._logs = logs
@@ -61,13 +61,11 @@ class LocalCrew:
     def wait(self, seconds: float) -> list[Done]:
         """The jobs that are done, after at most so long."""
         busy = [worker for worker in self._workers if worker.job is not None]
-        done = []
         with selectors.DefaultSelector() as selector:
             for worker in busy:
-                selector.register(worker.answers, selectors.EVENT_READ, worker)
-            for key, _ in selector.select(seconds):
-                done += self._hear(key.data)
-        return done
+                selector.register(worker.answers, selectors.EVENT_READ)
+            selector.select(seconds)
+        return [done for worker in busy for done in self._hear(worker)]
 
     def stop(self) -> None:
         """Tell all workers to save what they do and leave."""
@@ -92,6 +90,7 @@ class LocalCrew:
         log = next(name for name in names if name not in taken)
         orders, give = os.pipe()
         hear, answers = os.pipe()
+        os.set_blocking(hear, False)
         command = [sys.executable, "-m", "senior.sweep.worker", str(orders), str(answers), str(self._threads)]
         with open(log, "a") as file:
             process = subprocess.Popen(
@@ -109,22 +108,31 @@ class LocalCrew:
         return worker
 
     def _hear(self, worker: _Worker) -> list[Done]:
-        told = os.read(worker.answers, 1 << 16)
-        worker.heard += told
-        job = worker.job
+        """What a busy worker has to say, or that it is dead: its pipe may be kept open by what it had started."""
+        dead, job = worker.process.poll() is not None, worker.job
         assert job is not None
+        try:
+            told = os.read(worker.answers, 1 << 16)
+        except BlockingIOError:
+            if not dead:
+                return []
+            told = b""
+        worker.heard += told
         if worker.heard.endswith(b"\n"):
             outcomes, worker.heard, worker.job = outcomes_of(worker.heard.decode()), b"", None
             return [Done(job, outcomes)]
         if told:
             return []
-        code = worker.process.wait()
         self._workers.remove(worker)
+        if not dead:  # it dies, or has closed its pipe
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                worker.process.wait(1)
+            worker.process.kill()
         self._bury(worker)
-        return [Done(job, (), _why(code, worker.log))]
+        return [Done(job, (), _why(worker.process.returncode, worker.log))]
 
     def _bury(self, worker: _Worker) -> None:
-        worker.process.wait()
+        worker.process.wait(LEAVE_SECONDS)
         os.close(worker.orders)
         os.close(worker.answers)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from senior.rundir import told
@@ -28,6 +28,8 @@ def run(
     ray: the address of a Ray cluster to use instead. Raises `BadInput` before anything runs if a cell makes no sense,
     a directory holds another run, or another sweep is at work in ``out``.
     """
+    if jobs is not None and not 1 <= jobs <= 1024:
+        raise BadInput(f"--jobs {jobs} must be between 1 and 1024.")
     check_cells(cells)
     sweep = Sweep(cells)
     if not sweep.waiting:
@@ -38,11 +40,17 @@ def run(
         if ray is not None:
             from senior.sweep.cluster import RayCrew
 
-            crew = RayCrew(ray, cells[0].config.device, jobs, out)
+            crew = RayCrew(ray, cells[0].config.device, jobs, out, spectator.say)
         else:
             crew = LocalCrew(cells[0].config.device, jobs, out / "logs")
-        with closing(crew):
+        try:
             sweep.run(crew, spectator)
+        except KeyboardInterrupt:  # impatient: the workers see that nobody is there, save, and end
+            raise
+        except BaseException:
+            crew.close()
+            raise
+        crew.close()
     return sweep
 
 

@@ -1,7 +1,7 @@
 """The process that trains a sweep's cells: takes a job per line, answers with its outcomes, until the pipe ends.
 
-Started by `senior.sweep.local` as ``python -m senior.sweep.worker ORDERS ANSWERS DEVICE THREADS``; a Ray worker
-calls `train` itself. SIGTERM, or the end of its orders while it trains, stops it with everything saved.
+Started by `senior.sweep.local` as ``python -m senior.sweep.worker ORDERS ANSWERS THREADS``; a Ray worker calls `train`
+itself. SIGTERM, or the end of its orders while it trains, stops it with everything saved.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def train(job: Job, watch: Watch) -> tuple[Outcome, ...]:
     from senior import program  # starts JAX, which counts the processors then
 
     try:
-        results = program.train_all([(cell.config, cell.path) for cell in job], watch, go_on=True)
+        results = program.continue_all([(cell.config, cell.path) for cell in job], watch)
     except BadInput as error:
         return tuple(Outcome(str(cell.path), 0, False, str(error)) for cell in job)
     return tuple(_outcome(cell, result) for cell, result in zip(job, results, strict=True))
