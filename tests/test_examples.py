@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from senior.judgement import Judgement
+from senior.trainee import make_environment
 from tests.small import rows
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -78,7 +79,7 @@ def test_the_command_in_an_example_is_one(path: Path, monkeypatch: pytest.Monkey
     assert str(out) == command[1].split()[-1]
     monkeypatch.syspath_prepend(str(EXAMPLES))
     if config.env:
-        environment, spec = program.make_environment(config)
+        environment, spec = make_environment(config)
         for seed in (1, 2):
             first, _ = environment.reset(seed=seed)
             np.testing.assert_array_equal(first, environment.reset(seed=seed)[0])
