@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import zipfile
 from pathlib import Path
 
@@ -68,3 +69,8 @@ def unpack(path: Path) -> dict[str, np.ndarray]:
         }
     except Exception as error:
         raise Damaged(f"{path.name} is damaged ({error})") from error
+
+
+def slug(text: str) -> str:
+    """Text as a part of a file's or a directory's name."""
+    return re.sub(r"[^a-z0-9.]+", "-", text.lower()).strip("-.") or "unnamed"

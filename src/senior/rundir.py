@@ -248,10 +248,12 @@ def make_room(file: Path) -> None:
 
 
 def is_run(path: Path) -> bool:
-    """Whether the ``config.json`` there is one of ours. One that is damaged may be, and is told when it is read."""
+    """Whether there is a ``config.json`` of ours. One that is damaged may be, and is told when it is read."""
     try:
-        content = json.loads((path / "config.json").read_text())
-    except ValueError:
+        content = json.loads((path / "config.json").read_bytes())
+    except FileNotFoundError:
+        return False
+    except (OSError, ValueError):
         return True
     return isinstance(content, dict) and {"config", "protocol"} <= content.keys()
 

@@ -22,7 +22,7 @@ matplotlib.use("Agg")
 
 from matplotlib.figure import Figure
 
-from senior.files import write_atomically
+from senior.files import slug, write_atomically
 from senior.report.tables import Cell, latex, numbers, shown, to_csv
 from senior.types import BadInput
 
@@ -96,11 +96,6 @@ def write(sections: Iterable[Section], out: Path, title: str) -> Path:
     return page
 
 
-def slug(text: str) -> str:
-    """Text as a part of a file's name."""
-    return re.sub(r"[^a-z0-9.]+", "-", text.lower()).strip("-.")[:80] or "unnamed"
-
-
 class _Names:
     """Names that are taken, by kind."""
 
@@ -108,7 +103,7 @@ class _Names:
         self._taken: set[tuple[str, str]] = set()
 
     def free(self, kind: str, text: str) -> str:
-        name = first = slug(text)
+        name = first = slug(text)[:80]
         number = 1
         while (kind, name) in self._taken:
             number += 1

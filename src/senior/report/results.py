@@ -23,6 +23,7 @@ import numpy as np
 
 from senior.config import Config, from_json, to_json
 from senior.report.names import label, normal, options, words
+from senior.rundir import is_run
 from senior.types import BadInput
 
 APART = ("seed", "device", "checkpoint_every", "snapshot_every")
@@ -207,7 +208,7 @@ def _below(place: Path, seen: set[Path], left_out: list[LeftOut]) -> Iterator[Pa
         if own in seen:
             return
         seen.add(own)
-        if _is_run(place):
+        if is_run(place):
             yield place
             return
         children = sorted(child for child in place.iterdir() if child.is_dir())
@@ -216,17 +217,6 @@ def _below(place: Path, seen: set[Path], left_out: list[LeftOut]) -> Iterator[Pa
         return
     for child in children:
         yield from _below(child, seen, left_out)
-
-
-def _is_run(place: Path) -> bool:
-    """Whether the ``config.json`` there is one of ours, or may be and is damaged."""
-    try:
-        content = json.loads((place / "config.json").read_bytes())
-    except FileNotFoundError:
-        return False
-    except (OSError, ValueError):
-        return True
-    return isinstance(content, dict) and "config" in content and "protocol" in content
 
 
 # Reading one.

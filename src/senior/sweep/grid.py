@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -14,6 +13,7 @@ from typing import Annotated, Any
 import tyro
 
 from senior.config import Asking, Config
+from senior.files import slug
 from senior.options import parse, starting_from
 from senior.sweep.cells import Cell
 from senior.types import BadInput
@@ -130,8 +130,3 @@ def configured(arm: str, options: Mapping[str, str]) -> Config:
 def place(out: Path, config: Config, arm: str) -> Path:
     """The directory of a run of an arm."""
     return out / slug(config.env or config.task) / slug(arm) / f"seed-{config.seed}"
-
-
-def slug(text: str) -> str:
-    """A name for a directory."""
-    return re.sub(r"[^a-z0-9.]+", "-", text.lower()).strip("-.")
