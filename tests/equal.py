@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from senior.checkpoint import steps, unpack
 from senior.config import Config, Queries
+from senior.files import unpack
+from senior.rundir import saved_steps
 from tests.small import preferences_dump, small
 
 
@@ -47,7 +48,7 @@ OPTIONS = _OPTIONS.split()
 
 def progress_of(run: Path) -> dict[str, Any]:
     """What the newest checkpoint knows of a run beside its arrays."""
-    last = steps(run / "checkpoints")[0]
+    last = saved_steps(run / "checkpoints")[0]
     return json.loads(unpack(run / "checkpoints" / f"step-{last:010d}.npz")["about"].tobytes())["progress"]
 
 
@@ -77,7 +78,7 @@ def _progress(run: Path, interrupted: bool) -> dict[str, Any]:
 
 
 def _arrays(run: Path, interrupted: bool) -> dict[str, np.ndarray]:
-    last = f"step-{steps(run / 'checkpoints')[0]:010d}.npz"
+    last = f"step-{saved_steps(run / 'checkpoints')[0]:010d}.npz"
     found, facts = {}, []
     for path in sorted(run.rglob("*.npz")):
         where = str(path.relative_to(run))

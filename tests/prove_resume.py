@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from senior.checkpoint import steps
 from senior.program import train
+from senior.rundir import saved_steps
 from tests.equal import OPTIONS, assert_same_run, short
 
 ROOT = Path(__file__).parents[1]
@@ -73,7 +73,7 @@ def test_killed_at_random_moments(tmp_path: Path):
             finished = child.returncode == 0
             kills += child.returncode == -signal.SIGKILL
             assert child.returncode in (0, -signal.SIGKILL), complaint.decode()
-            at += steps(run / "checkpoints")[:1]
+            at += saved_steps(run / "checkpoints")[:1]
         assert_same_run(run, whole.path, interrupted=True)
         shutil.rmtree(run)
         runs += 1

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from senior import checkpoint, replay
-from senior.checkpoint import newest, restore, save, steps
+from senior.checkpoint import newest, restore, save
 from senior.files import Damaged, pack, unpack, write_atomically
 from senior.learner import Run
 from senior.replay import Fact
+from senior.rundir import saved_steps
 
 CAPACITY = 6
 
@@ -108,7 +109,7 @@ def test_there_is_none_at_first(tmp_path: Path):
 
 def test_the_two_newest_are_kept_and_facts_are_written_once(tmp_path: Path):
     saved(tmp_path, 1, 2, 3, 4)
-    assert steps(tmp_path) == [4, 3]
+    assert saved_steps(tmp_path) == [4, 3]
     chunks = [unpack(path) for path in sorted(tmp_path.glob("facts-*.npz"))]
     assert [len(chunk["reward"]) for chunk in chunks] == [1, 1, 1, 1]
     assert np.unique(np.concatenate([chunk["reward"] for chunk in chunks])).size == 4
@@ -159,7 +160,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_serves(
     # Going on from there, the damaged one takes nobody's place.
     run = advanced(run, 4)
     save(tmp_path, 4, run, progress(4), 2)
-    assert steps(tmp_path) == [4, 2]
+    assert saved_steps(tmp_path) == [4, 2]
     again = newest(tmp_path, empty, pytest.fail)
     assert again is not None
     assert_equal(again[1], run)
@@ -179,7 +180,7 @@ def test_if_all_are_damaged_each_is_named_and_none_is_used(tmp_path: Path):
     told: list[str] = []
     assert newest(tmp_path, empty, told.append) is None
     assert [name(step) in sentence for step, sentence in zip((5, 2), told, strict=True)] == [True, True]
-    assert steps(tmp_path) == [5, 2]
+    assert saved_steps(tmp_path) == [5, 2]
 
 
 def test_a_checkpoint_of_another_configuration_is_refused(tmp_path: Path):

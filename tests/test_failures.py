@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from senior.checkpoint import steps, unpack
 from senior.config import Config
 from senior.envs.episodes import AFTERWARDS, EVALUATION, TRAINING, episode_seed
 from senior.envs.point import Point
+from senior.files import unpack
 from senior.judgement import evaluate_run
 from senior.program import Quiet, Result, resume, train
+from senior.rundir import saved_steps
 from senior.types import BadInput
 from tests.equal import assert_same_run, progress_of
 from tests.small import rows, small
@@ -108,7 +109,7 @@ def assert_stopped(result: Result, step: int, message: str, said: Said) -> None:
     assert "\n" not in result.failure
     (sentence,) = [sentence for sentence in said.sentences if "stopped" in sentence]
     assert sentence == f"seed {result.seed} is stopped at step {step}, with a checkpoint: {result.failure}"
-    assert steps(result.path / "checkpoints")[0] == step
+    assert saved_steps(result.path / "checkpoints")[0] == step
     assert progress_of(result.path)["step"] == step
     for path in (result.path / "checkpoints").glob("*.npz"):
         for name, array in unpack(path).items():

@@ -20,12 +20,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from senior.checkpoint import steps, unpack
 from senior.config import Asking, Config
+from senior.files import unpack
 from senior.label.desk import Desk, Given, Side
 from senior.labels import export_labels
 from senior.preference_file import Rules, asked_of, connect, has_tables, pairs_of
 from senior.program import resume, train
+from senior.rundir import saved_steps
 from senior.types import BadInput
 from tests.equal import OPTIONS, assert_same_run, short
 from tests.small import rows
@@ -139,7 +140,7 @@ def test_a_trainer_that_is_killed_while_it_waits_goes_on_with_the_answers_it_got
     answer(run, 4)
     trainer.send_signal(signal.SIGKILL)
     trainer.communicate()
-    assert steps(run / "checkpoints")[0] == 400, "it is saved as it was before it asked"
+    assert saved_steps(run / "checkpoints")[0] == 400, "it is saved as it was before it asked"
     answer(run, 3)  # while nobody trains: the server lives on, and so does what draws
     with person(run):
         (result,) = resume(run, Stop())
@@ -193,7 +194,7 @@ def test_what_is_not_waited_for_is_learned_from_when_it_comes_and_again_at_the_s
     ]
     with pytest.raises(KeyboardInterrupt):
         train(config, run.parent, watcher=Late(run, breaks=True))
-    assert steps(run / "checkpoints")[0] == 600
+    assert saved_steps(run / "checkpoints")[0] == 600
     (result,) = resume(run, Late(run, beyond=645))
     assert result.finished
     assert labels(run) == labels(whole)

@@ -199,13 +199,14 @@ def test_only_the_studys_own_runs_count_and_only_those_of_one_protocol(tmp_path:
         packages = {"mujoco": "9.9"} if seed in (3, 4) else {}
         told = protocol()
         write_run(place / f"seed-{seed}", config, {**told, "packages": {**told["packages"], **packages}}, ("eval.csv",))
-    found, refused = reproduce.runs_by_arm(studies.values(), "quick", tmp_path)
+    runs = read([tmp_path]).runs
+    found, refused = reproduce.runs_by_arm(studies.values(), "quick", tmp_path, runs)
     assert [run.seed for run in found["mrn", "door-lock"]] == [0, 1, 2]
     assert refused == [
         f"Not judged: {place / 'seed-5'}: no run of its arm at the scale quick.",
         f"Not judged: {place / 'seed-3'} and 1 more: a protocol that most runs beside it do not have.",
     ]
-    at_paper, _ = reproduce.runs_by_arm(studies.values(), "paper", tmp_path)
+    at_paper, _ = reproduce.runs_by_arm(studies.values(), "paper", tmp_path, runs)
     assert not at_paper
     told = reproduce.write(studies, "quick", tmp_path)
     line = next(line for line in told.splitlines() if line.startswith("  mrn "))

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from senior.checkpoint import steps
 from senior.cli.display import Display
 from senior.cli.shared import DONE, INTERRUPTED
 from senior.config import Answering, Config, load
@@ -24,6 +23,7 @@ from senior.envs.point import Point
 from senior.judgement import load_policy
 from senior.presets import release
 from senior.program import Quiet, resume, train
+from senior.rundir import saved_steps
 from senior.schedule import plan
 from senior.trainee import Trainee
 from senior.types import BadInput
@@ -66,7 +66,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def assert_goes_on_from(run: Path, saved: int, asked: int, whole: Path) -> None:
     """The run stopped with that checkpoint and so many pairs asked; resumed, it equals the whole one."""
-    assert steps(run / "checkpoints")[:1] == ([saved] if saved else [])
+    assert saved_steps(run / "checkpoints")[:1] == ([saved] if saved else [])
     assert len(preferences_dump(run)) == asked
     watcher = Stop()
     (result,) = resume(run, watcher)
@@ -129,11 +129,11 @@ def test_interrupted_on_the_command_line_again_and_again(reference: Path, tmp_pa
     first = senior("SIGINT:575", "train", *OPTIONS, "--out", tmp_path)
     assert first.returncode == INTERRUPTED == 130, first.stderr
     assert f"interrupted at step 576, all saved; go on with: senior resume {run}" in first.stdout
-    assert steps(run / "checkpoints")[0] == 576
+    assert saved_steps(run / "checkpoints")[0] == 576
     second = senior("SIGTERM:777", "resume", run)
     assert second.returncode == INTERRUPTED, second.stderr
     assert "interrupted at step 778, all saved" in second.stdout
-    assert steps(run / "checkpoints")[0] == 778
+    assert saved_steps(run / "checkpoints")[0] == 778
     third = senior(None, "resume", run)
     assert third.returncode == DONE, third.stderr
     assert_same_run(run, reference / "seed-0", interrupted=True)
@@ -297,7 +297,7 @@ def test_with_all_checkpoints_damaged_there_is_one_clear_sentence(
 ):
     run = tmp_path / "seed-0"
     shutil.copytree(reference / "seed-0", run)
-    for step in steps(run / "checkpoints"):
+    for step in saved_steps(run / "checkpoints"):
         (run / "checkpoints" / f"step-{step:010d}.npz").write_bytes(b"")
     before = {path: path.read_bytes() for path in sorted(run.rglob("*.csv"))}
     with pytest.raises(BadInput, match=r"^No checkpoint in .*seed-0 can be read; the run cannot be resumed\.$"):

@@ -187,9 +187,7 @@ class Script:
                 (cell.path / "checkpoints").mkdir(parents=True, exist_ok=True)
                 (cell.path / "checkpoints" / f"step-{len(self.given):010d}.npz").touch()
                 return [Done(job, (), "its process was killed (signal 9)")]
-            outcomes.append(
-                Outcome(str(cell), 9, said == "finished", None if said in ("finished", "stopped") else said)
-            )
+            outcomes.append(Outcome(said == "finished", None if said in ("finished", "stopped") else said))
         return [Done(job, tuple(outcomes))]
 
     def stop(self) -> None:
@@ -271,7 +269,7 @@ def test_told_to_stop_it_gives_nothing_more_and_keeps_what_was_stopped_waiting(t
 def test_jobs_and_outcomes_travel_as_json(tmp_path: Path):
     made = tuple(cells(tmp_path.resolve(), 2))
     assert job_of(order(made)) == made
-    told = (Outcome("a", 3, False, "why"), Outcome("b", 4, True, None))
+    told = (Outcome(False, "why"), Outcome(True, None))
     assert outcomes_of(report(told)) == told
 
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from senior import fit, learner, parts, together
-from senior.checkpoint import steps
 from senior.config import Config
 from senior.learner import Learner
 from senior.methods import METHODS
@@ -21,6 +20,7 @@ from senior.program import Quiet, make_learner, resume, train_all
 from senior.replay import Fact
 from senior.reward.bilevel import FirstSteps
 from senior.reward.model import Labelled
+from senior.rundir import saved_steps
 from senior.shape import shape
 from senior.types import BadInput
 from tests.equal import assert_same_run, short
@@ -208,7 +208,7 @@ def test_an_error_in_one_program_ends_those_beside_it_with_all_saved(tmp_path: P
     runs = [(small("sac", steps=5000), tmp_path / "a"), (small("pebble", steps=100_000), tmp_path / "b")]
     with pytest.raises(OSError, match="No space"):
         train_all(runs, Breaks(), lift="vmap")
-    assert 0 < steps(tmp_path / "b" / "checkpoints")[0] < 50_000
+    assert 0 < saved_steps(tmp_path / "b" / "checkpoints")[0] < 50_000
 
 
 def test_programs_one_after_the_other_do_not_disturb_each_other(tmp_path: Path):

@@ -19,17 +19,11 @@ import numpy as np
 from senior.files import Damaged, pack, unpack, write_atomically
 from senior.learner import Run
 from senior.replay import Fact
+from senior.rundir import saved_steps
 
 KEPT = 2
 FORMAT = 3
-_NAME = re.compile(r"step-(\d{10})\.npz")
 _CHUNK = re.compile(r"facts-(\d{10})-(\d{10})\.npz")
-
-
-def steps(directory: Path) -> list[int]:
-    """Steps at which there are checkpoints, newest first."""
-    found = (_NAME.fullmatch(path.name) for path in directory.glob("step-*.npz"))
-    return sorted((int(match[1]) for match in found if match), reverse=True)
 
 
 def save(directory: Path, step: int, run: Run, progress: dict[str, Any], written: int) -> int:
@@ -52,7 +46,7 @@ def save(directory: Path, step: int, run: Run, progress: dict[str, Any], written
     about = {"format": FORMAT, "step": step, "count": count, "progress": progress}
     leaves["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
     write_atomically(directory / f"step-{step:010d}.npz", pack(leaves))
-    for old in steps(directory)[KEPT:]:
+    for old in saved_steps(directory)[KEPT:]:
         (directory / f"step-{old:010d}.npz").unlink()
     return count
 
@@ -90,7 +84,7 @@ def restore(directory: Path, step: int, template: Run) -> tuple[Run, dict[str, A
 
 def standing(directory: Path) -> dict[str, Any] | None:
     """The progress in the newest checkpoint that can be read, without the rest of it; None if there is none."""
-    for step in steps(directory):
+    for step in saved_steps(directory):
         with contextlib.suppress(Damaged, KeyError, ValueError):
             return json.loads(unpack(directory / f"step-{step:010d}.npz")["about"].tobytes())["progress"]
     return None
@@ -106,13 +100,13 @@ def newest(
     """
     for leftover in directory.glob("*.tmp"):
         leftover.unlink()
-    for step in steps(directory):
+    for step in saved_steps(directory):
         try:
             run, progress = restore(directory, step, template())
         except Damaged as error:
             tell(f"Checkpoint {error}; trying the one before.")
             continue
-        for newer in steps(directory):
+        for newer in saved_steps(directory):
             if newer > step:
                 (directory / f"step-{newer:010d}.npz").unlink()
         for path in directory.glob("facts-*.npz"):

@@ -7,16 +7,42 @@ pickled.
 from __future__ import annotations
 
 import io
+import json
 import os
 import re
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 
 class Damaged(Exception):
     """A file that cannot be used; the text names it and says why."""
+
+
+def hold(path: Path) -> int | None:
+    """Lock a directory until the descriptor that is returned is closed, at the latest with this process.
+
+    None where there are no such locks (Windows); a file system without them holds nothing. Raises `BlockingIOError` if
+    another process holds it, and `OSError` if there is no such directory.
+    """
+    if fcntl is None:
+        return None
+    lock = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(lock)
+        raise
+    except OSError:
+        pass
+    return lock
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -74,3 +100,12 @@ def unpack(path: Path) -> dict[str, np.ndarray]:
 def slug(text: str) -> str:
     """Text as a part of a file's or a directory's name."""
     return re.sub(r"[^a-z0-9.]+", "-", text.lower()).strip("-.") or "unnamed"
+
+
+def json_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a file that another process may be writing; empty if there is none that can be read."""
+    try:
+        content = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

@@ -129,14 +129,19 @@ def _opened(trainee: Trainee, device: str, watcher: Watcher) -> Waiting:
     directory = trainee.directory
     if (directory.path / "config.json").is_file():
         directory.check_holds(trainee.config)
-        with rundir.told(directory.path):
-            directory.lock()
-        _compare_protocol(trainee, device, watcher)
-        return Waiting(trainee, partial(trainee.resume, watcher.say))
+        return _reopened(trainee, device, watcher)
     directory.check_free()
     trainee.reset(0)
     directory.create(trainee.config, rundir.protocol(trainee.spec, device))
     return Waiting(trainee, trainee.begin)
+
+
+def _reopened(trainee: Trainee, device: str, watcher: Watcher) -> Waiting:
+    """A run that is there; `BadInput` if another process trains it."""
+    with rundir.told(trainee.directory.path):
+        trainee.directory.lock()
+    _compare_protocol(trainee, device, watcher)
+    return Waiting(trainee, partial(trainee.resume, watcher.say))
 
 
 def _check_runs(runs: Sequence[tuple[Config, Path]], workers: int | None, runs_per_device: int | None) -> str:
@@ -204,15 +209,11 @@ def resume(
                 spec = spec_of(config)
                 learner = make_learner(config, spec)
                 trainee = Trainee(config, directory, learner, spec, pools.worker(learner))
-                with rundir.told(directory):
-                    trainee.directory.lock()
+                waiting.append(_reopened(trainee, device, watcher))
             except BadInput as error:
                 if len(found) == 1:
                     raise
                 results.append(unopened(directory, error, watcher))
-                continue
-            _compare_protocol(trainee, device, watcher)
-            waiting.append(Waiting(trainee, partial(trainee.resume, watcher.say)))
         return results + train_waiting(waiting, watcher, None, runs_per_device, len(found) == 1, page)
 
 

@@ -12,6 +12,7 @@ import io
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 from collections.abc import Iterator, Mapping
@@ -27,13 +28,8 @@ from tensorboardX import SummaryWriter
 
 from senior.config import Config, differences, load, to_json
 from senior.envs import metaworld
-from senior.files import Damaged, pack, unpack, write_atomically
+from senior.files import Damaged, hold, pack, unpack, write_atomically
 from senior.types import BadInput, EnvSpec
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
 
 EVAL = ("step", "labels", "queried", "episodes", "success_rate", "return_mean", "return_std")
 TRAIN = (
@@ -76,6 +72,7 @@ TIMING = (
     "checkpoint",
 )
 TABLES = {"eval.csv": EVAL, "train.csv": TRAIN, "timing.csv": TIMING}
+_CHECKPOINT = re.compile(r"step-(\d{10})\.npz")
 HELD = "is being trained by another process"
 """Said of a run whose lock another process holds."""
 PACKAGES = ("senior-rl", "jax", "jaxlib", "optax", "numpy", "gymnasium", "metaworld", "mujoco")
@@ -120,16 +117,12 @@ class RunDirectory:
 
     def lock(self) -> None:
         """Keep other processes from training the same run; the lock goes with the process. `BadInput` if one does."""
-        if fcntl is None or self._lock is not None:
-            return
-        self._lock = os.open(self.path, os.O_RDONLY)
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self.close()
-            raise BadInput(f"The run in {self.path} {HELD}.") from None
-        except OSError:  # a file system without locks
-            pass
+        if self._lock is None:
+            try:
+                self._lock = hold(self.path)
+            except BlockingIOError:
+                self.close()
+                raise BadInput(f"The run in {self.path} {HELD}.") from None
 
     def check_holds(self, config: Config) -> None:
         """`BadInput` if the run that is there is another one. Where it is computed may differ."""
@@ -256,6 +249,12 @@ def is_run(path: Path) -> bool:
     except (OSError, ValueError):
         return True
     return isinstance(content, dict) and {"config", "protocol"} <= content.keys()
+
+
+def saved_steps(checkpoints: Path) -> list[int]:
+    """Steps at which there are checkpoints in that folder of a run, newest first."""
+    found = (_CHECKPOINT.fullmatch(path.name) for path in checkpoints.glob("step-*.npz"))
+    return sorted((int(match[1]) for match in found if match), reverse=True)
 
 
 def read_protocol(path: Path) -> dict[str, Any]:

@@ -6,9 +6,26 @@ import signal
 import sys
 from collections.abc import Sequence
 from types import FrameType
-from typing import Any
+from typing import Any, Protocol
 
 from tqdm import tqdm
+
+
+class Stoppable(Protocol):
+    """What is told to stop, all saved."""
+
+    stop: bool
+
+
+def stop_when_asked(told: Stoppable) -> dict[int, Any]:
+    """Let the first SIGINT or SIGTERM stop something, and a second one end the program; what they did before."""
+
+    def asked(number: int, frame: FrameType | None) -> None:
+        if told.stop:
+            raise KeyboardInterrupt
+        told.stop = True
+
+    return {number: signal.signal(number, asked) for number in (signal.SIGINT, signal.SIGTERM)}
 
 
 class Display:
@@ -17,8 +34,7 @@ class Display:
     def __init__(self) -> None:
         self.stop = False
         self._bar: tqdm[Any] | None = None
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._asked_to_stop)
+        stop_when_asked(self)
 
     def advance(self, step: int, trainees: Sequence[Any]) -> None:
         """Draw, ten times a second at most."""
@@ -42,11 +58,6 @@ class Display:
     def close(self) -> None:
         if self._bar is not None:
             self._bar.close()
-
-    def _asked_to_stop(self, number: int, frame: FrameType | None) -> None:
-        if self.stop:
-            raise KeyboardInterrupt
-        self.stop = True
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

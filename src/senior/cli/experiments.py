@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import tyro
 
+from senior.cli.display import stop_when_asked
 from senior.cli.shared import DONE, FAILED, INTERRUPTED
+from senior.extras import require
 from senior.options import parse
 from senior.sweep import grid
-from senior.sweep.cells import Cell, check_cells, standing
+from senior.sweep.cells import Cell, check_cells, is_finished, standing
 from senior.types import BadInput
-
-if TYPE_CHECKING:
-    from senior.sweep.board import Board
 
 
 @dataclass(frozen=True)
@@ -54,8 +51,8 @@ def sweep(arguments: Sequence[str]) -> int:
     options = parse(SweepOptions, mine, None, "sweep")
     axes = grid.merged(grid.read(options.file), given) if options.file else given
     cells = grid.cells_of(axes, options.out)
-    check_cells(cells)
     if options.list:
+        check_cells(cells)
         for cell in cells:
             print(f"{cell}  {_stands(cell)}")
         return DONE
@@ -68,8 +65,13 @@ def run_cells(cells: Sequence[Cell], out: Path, jobs: int | None, ray: str | Non
     from senior.sweep.run import run
 
     board = Board(out)
-    with _stopping(board), board:
-        done = run(cells, out, board, jobs, ray)
+    before = stop_when_asked(board)
+    try:
+        with board:
+            done = run(cells, out, board, jobs, ray)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
     print(
         f"{len(done.finished)} of {len(cells)} cells are finished"
         + (f", {len(done.failed)} failed:" if done.failed else ".")
@@ -82,27 +84,10 @@ def run_cells(cells: Sequence[Cell], out: Path, jobs: int | None, ray: str | Non
     return FAILED if done.failed else DONE
 
 
-@contextmanager
-def _stopping(board: Board) -> Iterator[None]:
-    """The first SIGINT or SIGTERM stops the sweep, all saved; a second one ends the program at once."""
-
-    def asked(number: int, frame: FrameType | None) -> None:
-        if board.stop:
-            raise KeyboardInterrupt
-        board.stop = True
-
-    before = {number: signal.signal(number, asked) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def _stands(cell: Cell) -> str:
-    told = standing(cell.path)
-    if told.get("phase") == "finished":
+    if is_finished(cell.path):
         return "finished"
+    told = standing(cell.path)
     return f"step {told['step']:,}" if "step" in told else "not begun"
 
 
@@ -170,14 +155,11 @@ def report(arguments: list[str]) -> int:
     if not options.runs:
         raise BadInput("Name at least one run, or a directory that holds some.")
     from senior.report.build import report
+    from senior.report.results import grouped
 
     built = report(options.runs, options.out)
-    reasons: dict[str, list[Path]] = {}
-    for path, reason in built.left_out:
-        reasons.setdefault(reason, []).append(path)
-    for reason, paths in reasons.items():
-        more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
-        print(f"left out: {paths[0]}{more}: {reason}", file=sys.stderr)
+    for line in grouped(built.left_out):
+        print(f"left out: {line}", file=sys.stderr)
     print(f"{built.runs} runs: {built.page}")
     return DONE
 
@@ -198,11 +180,8 @@ def watch(arguments: list[str]) -> int:
     options = parse(WatchOptions, arguments, None, "watch")
     if not options.runs:
         raise BadInput("Name at least one run, or a directory that holds some, or will.")
-    try:
-        from senior.report.watch import serve
-    except ImportError as error:
-        raise BadInput(
-            f"The live page needs {error.name}, which is not installed: pip install 'senior-rl[report]'"
-        ) from None
+    require("The live page", "report", "starlette", "uvicorn")
+    from senior.report.watch import serve
+
     serve(options.runs, options.host, options.port)
     return DONE

@@ -5,7 +5,6 @@ Needs nothing that is not installed by default; `senior.label.server`, which it 
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import signal
@@ -17,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from senior.extras import require
 from senior.types import BadInput
 
 SERVED = 75
@@ -83,11 +83,7 @@ class Served:
 
 def check_installed() -> None:
     """`BadInput` if what the server needs is not there."""
-    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        raise BadInput(
-            f"The labelling page needs {' and '.join(missing)}, which is not installed: pip install 'senior-rl[label]'"
-        )
+    require("The labelling page", "label", *NEEDED)
 
 
 class Serving:

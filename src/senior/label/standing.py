@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 from senior.config import Config
 from senior.envs.metaworld import TASKS
+from senior.files import json_object
 from senior.label.desk import Assignment, Desk
 
 
@@ -101,9 +101,9 @@ class Standing:
 def trainer(run: Path) -> dict[str, Any]:
     """What the trainer is doing: phase and a sentence."""
     try:
-        told = json.loads((run / "status.json").read_text())
+        told = json_object(run / "status.json")
         phase, step, steps = told["phase"], told["step"], told["steps"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except KeyError:
         return {"phase": "starting", "text": "The run has not begun."}
     if phase == "finished":
         return {"phase": phase, "text": f"Training has finished, after {step:,} steps."}

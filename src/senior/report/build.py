@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
+from senior.extras import require
 from senior.report import pairs, sections, visitation
 from senior.report.looks import Look, looks
 from senior.report.page import Section, write
@@ -28,11 +28,7 @@ class Built(NamedTuple):
 
 def check_installed() -> None:
     """`BadInput` if what a report needs is not there."""
-    missing = [name for name in ("jinja2", "rliable") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise BadInput(
-            f"A report needs {' and '.join(missing)}, which is not installed: pip install 'senior-rl[report]'"
-        )
+    require("A report", "report", "jinja2", "rliable")
 
 
 def report(places: Sequence[Path], out: Path, first: Sequence[Section] = (), unfinished: bool = False) -> Built:
@@ -44,10 +40,20 @@ def report(places: Sequence[Path], out: Path, first: Sequence[Section] = (), unf
     Raises `BadInput` if there is no run with an evaluation, if ``out`` cannot be written, or if what draws the page is
     not installed.
     """
+    return page_of(found(places, unfinished), out, first)
+
+
+def found(places: Sequence[Path], unfinished: bool = False) -> Results:
+    """What a report on ``places`` is made of. `BadInput` as from `report`."""
     check_installed()
     results = read(places, unfinished)
     if not results.runs:
         raise BadInput(_nothing(places, results))
+    return results
+
+
+def page_of(results: Results, out: Path, first: Sequence[Section] = ()) -> Built:
+    """The page of runs that are read already. `BadInput` if ``out`` cannot be written."""
     tasks = sections.by_task(results.runs)
     colours = looks(label for arms in tasks.values() for label in arms)
     title = f"{_counted(len(results.runs), 'run')} of {_counted(len(colours), 'arm')}"

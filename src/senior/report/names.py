@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import Field, asdict, fields, is_dataclass, replace
+from dataclasses import Field, fields, is_dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple, get_type_hints
 
 import tyro
 
-from senior.config import Answering, Config, differences
+from senior import parts
+from senior.config import Config, differences
 from senior.presets import preset, release, with_budget
 from senior.teachers import recorded, scripted
 from senior.types import BadInput
@@ -93,11 +94,7 @@ def words(config: Config) -> tuple[str, ...]:
 
 def normal(config: Config) -> Config:
     """With the numbers of a scripted teacher filled in, as a run's ``config.json`` has them."""
-    own = scripted.TEACHERS.get(config.teacher)
-    if own is None:
-        return config
-    asked = {name: value for name, value in asdict(config.answering).items() if value is not None}
-    return replace(config, answering=Answering(**{**own._asdict(), **asked}))
+    return replace(config, answering=parts.answering(config)) if config.teacher in scripted.TEACHERS else config
 
 
 def _short(dotted: str, value: Any) -> Any:

@@ -52,6 +52,17 @@ class LeftOut(NamedTuple):
     reason: str
 
 
+def grouped(left_out: Sequence[LeftOut]) -> list[str]:
+    """A line for every reason, with the first path and how many more there are."""
+    reasons: dict[str, list[Path]] = defaultdict(list)
+    for path, reason in left_out:
+        reasons[reason].append(path)
+    return [
+        f"{paths[0]}{f' and {len(paths) - 1} more' if len(paths) > 1 else ''}: {reason}"
+        for reason, paths in reasons.items()
+    ]
+
+
 @dataclass(frozen=True)
 class Arm:
     """What is averaged over seeds."""

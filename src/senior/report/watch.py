@@ -35,7 +35,7 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainT
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from senior.label.guard import is_loopback
+from senior.label.guard import SEALED, is_loopback
 from senior.types import BadInput
 
 LOOK_SECONDS = 2.0
@@ -59,14 +59,7 @@ FILES = (
 SCRIPT = Path(__file__).with_name("watch.js")
 FILE_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
 """Of drawings, which have a style on every line, when they are opened by themselves."""
-HEADERS = {
-    "Cache-Control": "no-store",
-    "X-Frame-Options": "DENY",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-}
+HEADERS = {**SEALED, "Cache-Control": "no-store"}
 
 
 @dataclass(frozen=True)

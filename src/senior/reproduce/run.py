@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from senior.config import Config, differences
-from senior.report.build import report
+from senior.report.build import found, page_of
 from senior.report.names import normal
-from senior.report.results import Run, read
+from senior.report.results import LeftOut, Run, grouped
 from senior.reproduce import page
 from senior.reproduce.studies import Arm, Scale, Study, Table, chosen, configuration
 from senior.sweep.cells import Cell
@@ -47,18 +47,18 @@ def cells(studies: Iterable[Study], seeds: Sequence[int], scale: Scale, out: Pat
 
 
 def runs_by_arm(
-    studies: Iterable[Study], scale: Scale, out: Path
+    studies: Iterable[Study], scale: Scale, out: Path, runs: Sequence[Run]
 ) -> tuple[dict[tuple[str, str], list[Run]], list[str]]:
-    """Finished runs below ``out`` by arm and task, and in sentences what is there and does not count.
+    """Of finished ``runs`` those below ``out`` by arm and task, and in sentences what is there and does not count.
 
     Runs count that were trained with the configuration of that arm, task and scale, and of those the most that agree in
     all that a number depends on (`senior.report.results.Arm`).
     """
     there: dict[Path, list[Run]] = {}
-    for run in read([out]).runs:
+    for run in runs:
         there.setdefault(run.path.parent, []).append(run)
-    found: dict[tuple[str, str], list[Run]] = {}
-    refused: dict[str, list[Path]] = {}
+    counted: dict[tuple[str, str], list[Run]] = {}
+    refused: list[LeftOut] = []
     for study in studies:
         for task in study.tasks:
             for arm in study.arms:
@@ -66,18 +66,15 @@ def runs_by_arm(
                 for run in there.get(folder(out, arm, task, scale), []):
                     wanted = configuration(arm, task, run.seed, scale)
                     if run.config is None or differences(_comparable(run.config), _comparable(wanted)):
-                        refused.setdefault(f"no run of its arm at the scale {scale}", []).append(run.path)
+                        refused.append(LeftOut(run.path, f"no run of its arm at the scale {scale}"))
                     else:
                         alike.setdefault(run.arm.fingerprint, []).append(run)
                 most = max(alike.values(), key=len, default=[])
                 for run in (run for own in alike.values() if own is not most for run in own):
-                    refused.setdefault("a protocol that most runs beside it do not have", []).append(run.path)
+                    refused.append(LeftOut(run.path, "a protocol that most runs beside it do not have"))
                 if most:
-                    found[arm.name, task] = most
-    return found, [
-        f"Not judged: {paths[0]}{f' and {len(paths) - 1} more' if len(paths) > 1 else ''}: {reason}."
-        for reason, paths in refused.items()
-    ]
+                    counted[arm.name, task] = most
+    return counted, [f"Not judged: {line}." for line in grouped(refused)]
 
 
 def _comparable(config: Config) -> Config:
@@ -87,7 +84,8 @@ def _comparable(config: Config) -> Config:
 
 def write(studies: dict[Table, Study], scale: Scale, out: Path) -> str:
     """The page of what is finished below ``out``, in ``out/report``; returns its verdicts in lines for a terminal."""
-    runs, refused = runs_by_arm(studies.values(), scale, out)
+    results = found([out])
+    runs, refused = runs_by_arm(studies.values(), scale, out, results.runs)
     judged = page.judge(list(studies), studies, runs)
-    built = report([out], out / "report", page.sections(judged, scale, refused))
+    built = page_of(results, out / "report", page.sections(judged, scale, refused))
     return "\n".join([page.summary(judged, scale), *refused, str(built.page)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,9 @@ from typing import Any, NamedTuple
 
 from senior import parts
 from senior.config import Config, from_json, made_by, to_json
+from senior.files import json_object
 from senior.fit import check_fit, check_offered, spec_of
-from senior.rundir import RunDirectory
+from senior.rundir import RunDirectory, saved_steps
 from senior.types import BadInput, EnvSpec
 
 
@@ -34,8 +34,6 @@ Job = tuple[Cell, ...]
 class Outcome(NamedTuple):
     """What became of a cell."""
 
-    path: str
-    step: int
     finished: bool
     failure: str | None
     """Why it was stopped; None: it finished, or was told to stop."""
@@ -80,11 +78,7 @@ def check_cells(cells: Sequence[Cell]) -> None:
 
 def standing(path: Path) -> dict[str, Any]:
     """What a run says that it is doing: phase, step, labels, success and so on; empty if nothing can be read."""
-    try:
-        told = json.loads((path / "status.json").read_text())
-    except (OSError, ValueError):
-        return {}
-    return told if isinstance(told, dict) else {}
+    return json_object(path / "status.json")
 
 
 def opened_at(path: Path) -> int:
@@ -102,8 +96,7 @@ def is_finished(path: Path) -> bool:
 
 def saved_step(path: Path) -> int:
     """The step of a run's newest checkpoint; -1: there is none."""
-    found = (re.fullmatch(r"step-(\d+)\.npz", file.name) for file in (path / "checkpoints").glob("step-*.npz"))
-    return max((int(match[1]) for match in found if match), default=-1)
+    return next(iter(saved_steps(path / "checkpoints")), -1)
 
 
 def order(job: Job) -> str:

@@ -17,14 +17,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from senior.extras import require
 from senior.sweep.cells import Done, Job, Outcome, job_of, order, outcomes_of, report
 from senior.sweep.cores import take_cores
+from senior.sweep.scheduler import LEAVE_SECONDS
 from senior.sweep.worker import Watch, train
 from senior.types import BadInput
-
-LEAVE_SECONDS = 120.0
-"""How long actors that were told to stop may take to save what they do."""
-
 
 CONNECT_SECONDS = 10.0
 
@@ -55,7 +53,7 @@ class Hand:
         cells = job_of(job)
         if not self._marker.exists():
             reason = f"the machine {platform.node()} does not see {self._marker.parent}, which all machines must share"
-            return report([Outcome(str(cell.path), 0, False, reason) for cell in cells])
+            return report([Outcome(False, reason)] * len(cells))
         return report(train(cells, self._watch))
 
     def stop(self) -> None:
@@ -164,10 +162,9 @@ def _connect(address: str) -> Any:
         raise BadInput("A sweep uses a Ray cluster only with a token: leave RAY_AUTH_MODE out, or set it to token.")
     os.environ["RAY_AUTH_MODE"] = "token"
     os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "error")  # else its retries fill the terminal
-    try:
-        import ray
-    except ImportError:
-        raise BadInput("Sweeps on a cluster need ray, which is not installed: pip install 'senior-rl[ray]'") from None
+    require("A sweep on a cluster", "ray", "ray")
+    import ray
+
     kept = Path(os.environ.get("RAY_AUTH_TOKEN_PATH", Path.home() / ".ray" / "auth_token"))
     if not os.environ.get("RAY_AUTH_TOKEN") and not kept.is_file():
         raise BadInput(f"The Ray cluster's token is neither in RAY_AUTH_TOKEN nor in {kept}.")

@@ -13,10 +13,8 @@ from pathlib import Path
 
 from senior.rundir import threads
 from senior.sweep.cells import Done, Job, order, outcomes_of
+from senior.sweep.scheduler import LEAVE_SECONDS
 from senior.types import BadInput
-
-LEAVE_SECONDS = 120.0
-"""How long a worker that was told to stop may take to save what it does."""
 
 
 @dataclass

@@ -7,16 +7,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from senior.files import hold
 from senior.rundir import told
 from senior.sweep.cells import Cell, check_cells
 from senior.sweep.local import LocalCrew
 from senior.sweep.scheduler import Spectator, Sweep
 from senior.types import BadInput
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
 
 
 def run(
@@ -56,20 +52,13 @@ def run(
 
 @contextmanager
 def _alone(out: Path) -> Iterator[None]:
-    """Keep other sweeps out of a directory; the lock goes with the process."""
-    if fcntl is None:
-        yield
-        return
-    with told(out):
-        lock = os.open(out, os.O_RDONLY)
+    """Keep other sweeps out of a directory."""
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock = hold(out)
     except BlockingIOError:
-        os.close(lock)
         raise BadInput(f"Another sweep is at work in {out}.") from None
-    except OSError:  # a file system without locks
-        pass
     try:
         yield
     finally:
-        os.close(lock)
+        if lock is not None:
+            os.close(lock)

@@ -13,6 +13,8 @@ from senior.sweep.cells import Cell, Done, Job, Outcome, is_finished, opened_at,
 RETRIES = 3
 """How often a cell that failed is tried again."""
 LOOK_SECONDS = 0.5
+LEAVE_SECONDS = 120.0
+"""How long a worker that was told to stop may take to save what it does."""
 
 
 class Crew(Protocol):

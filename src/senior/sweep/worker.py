@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from queue import SimpleQueue
 from typing import Any
 
-from senior.sweep.cells import Cell, Job, Outcome, job_of, report
+from senior.sweep.cells import Job, Outcome, job_of, report
 from senior.sweep.cores import take_cores
 from senior.types import BadInput
 
@@ -39,12 +39,8 @@ def train(job: Job, watch: Watch) -> tuple[Outcome, ...]:
     try:
         results = program.continue_all([(cell.config, cell.path) for cell in job], watch)
     except BadInput as error:
-        return tuple(Outcome(str(cell.path), 0, False, str(error)) for cell in job)
-    return tuple(_outcome(cell, result) for cell, result in zip(job, results, strict=True))
-
-
-def _outcome(cell: Cell, result: Any) -> Outcome:
-    return Outcome(str(cell.path), result.step, result.finished, result.failure)
+        return (Outcome(False, str(error)),) * len(job)
+    return tuple(Outcome(result.finished, result.failure) for result in results)
 
 
 def main(orders: int, answers: int, threads: int) -> None:
