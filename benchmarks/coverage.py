@@ -1,7 +1,7 @@
 """How often `senior.report.statistics.mean_interval` holds the truth: ``python benchmarks/coverage.py``.
 
-Seeds' true success rates are drawn from a beta distribution, ten episodes of each are counted, and the 90 % interval of so
-many seeds is compared with the distribution's mean.
+Seeds' true success rates are drawn from a beta distribution, ten episodes of each are counted, and the 90 % interval of
+so many seeds is compared with the distribution's mean.
 """
 
 from __future__ import annotations
