@@ -14,7 +14,8 @@ from senior.files import pack
 from senior.preference_file import Rules
 from senior.preferences import Preferences
 from senior.presets import preset
-from senior.report.results import Run, read
+from senior.report.records import Run
+from senior.report.results import read
 from senior.types import Answers, Pairs, Query
 from tests.many_runs import ACTION, OBSERVATION, protocol, write_run
 

@@ -24,11 +24,13 @@ from senior.methods import METHODS
 from senior.options import parse
 from senior.presets import preset, release, with_budget
 from senior.report import across, sections
+from senior.report.bands import MOST, Band, Frame, banded
 from senior.report.build import Built, report
 from senior.report.looks import COLOURS, in_order, looks
 from senior.report.names import label, normal, options
 from senior.report.page import Drawing, Section, Table, write
-from senior.report.results import NOT_TOLD, Results, read
+from senior.report.records import NOT_TOLD
+from senior.report.results import Results, read
 from senior.report.statistics import interquartile_means
 from senior.report.tables import latex, shown
 from senior.types import BadInput
@@ -362,6 +364,26 @@ def test_runs_evaluated_at_other_steps_are_read_off_lines():
     )
     assert list(places) == [2, 3, 4]
     assert values == pytest.approx(np.array([[1, 2, 3], [1, 2, 3]]))
+
+
+@pytest.mark.parametrize("bands", [MOST, MOST + 1])
+def test_a_few_bands_share_an_axis_and_more_have_a_panel_each(bands: int):
+    x = np.array([0.0, 40.0, 80.0])
+    labels = [f"pebble --budget {10 * (i + 1)}" for i in range(bands)]
+    own = {label: Band(x, np.full(3, 0.1 * i), np.full(3, 0.1 * i - 0.1), x / 800) for i, label in enumerate(labels)}
+    figure = banded(own, looks(labels), Frame("door-lock", "steps", "rate", 100.0))
+    figure.canvas.draw()
+    axes = [axis for axis in figure.axes if axis.axison]
+    assert len(axes) == (1 if bands == MOST else bands)
+    for axis in axes:
+        assert axis.get_xlim() == (0, 100)
+        assert axis.get_ylim() == (-0.03, 1.03)
+        assert len(axis.lines) == bands  # the others' too, for comparison
+    assert sum(len(axis.collections) for axis in axes) == bands
+    if bands > MOST:
+        for label, axis in zip(labels, axes, strict=True):
+            assert axis.get_title() == label
+            assert [line.get_color() for line in axis.lines].count(looks(labels)[label].colour) == 1
 
 
 GRID = {

@@ -15,7 +15,8 @@ from scipy import stats
 from senior.checks import check
 from senior.cli import main
 from senior.cli.shared import BAD_INPUT, DONE
-from senior.report.results import Run, read
+from senior.report.records import Run
+from senior.report.results import read
 from senior.reproduce import run as reproduce
 from senior.reproduce.studies import (
     AVERAGES,

@@ -20,7 +20,7 @@ from senior.report.asked import asked
 from senior.report.looks import looks
 from senior.report.page import Drawing, Section
 from senior.report.plane import Plane, evenly, firsts, plane_of, visited
-from senior.report.results import LeftOut, Run, Unusable
+from senior.report.records import LeftOut, Run, Unusable
 from senior.rundir import TRAIN
 from tests.planted import Asking, config_of, run_of, runs_below, samples, snapshot
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from senior.envs.metaworld import POSITION, TASKS
 from senior.preference_file import BUSY_SECONDS, SCHEMA_VERSION
-from senior.report.results import Run, Unusable
+from senior.report.records import Run, Unusable
 
 FILE = "preferences.sqlite"
 OBJECT = slice(4, 7)

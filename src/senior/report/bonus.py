@@ -23,7 +23,7 @@ from senior.report.looks import STYLE, Look, canvas, legend
 from senior.report.page import Drawing, Table
 from senior.report.panels import colormap, panels
 from senior.report.plane import Arms, Plane, evenly, usable
-from senior.report.results import LeftOut, Run, Unusable, columns
+from senior.report.records import LeftOut, Run, Unusable, columns
 from senior.report.tables import Cell
 
 COLUMNS = 3

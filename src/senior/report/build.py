@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from senior.extras import require
-from senior.report import pairs, sections, visitation
+from senior.report import comparison, pairs, sections, visitation
+from senior.report.cells import Tasks
 from senior.report.looks import Look, looks
 from senior.report.page import Section, write
 from senior.report.protocol import left_out, protocol
-from senior.report.results import LeftOut, Results, read
+from senior.report.records import LeftOut
+from senior.report.results import Results, read
 from senior.types import BadInput
 
 
@@ -62,12 +64,12 @@ def page_of(results: Results, out: Path, first: Sequence[Section] = ()) -> Built
     return Built(page, len(results.runs), list(results.left_out))
 
 
-def _parts(results: Results, tasks: sections.Tasks, colours: Mapping[str, Look]) -> Iterator[Section | None]:
+def _parts(results: Results, tasks: Tasks, colours: Mapping[str, Look]) -> Iterator[Section | None]:
     """One by one, when they are asked for."""
     yield sections.summary(tasks, results.shared)
     yield sections.curves(tasks, colours)
     yield sections.labels(tasks, colours)
-    yield sections.comparison(tasks, colours)
+    yield comparison.comparison(tasks, colours)
     yield sections.reward_model(tasks, colours)
     yield visitation.section(results.runs)
     yield pairs.section(results.runs)

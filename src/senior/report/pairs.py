@@ -17,7 +17,7 @@ from senior.report.looks import STYLE, Look, looks
 from senior.report.page import Drawing, Section, Table
 from senior.report.panels import Panel, panels
 from senior.report.plane import Plane, evenly, plane_of, usable
-from senior.report.results import LeftOut, Run
+from senior.report.records import LeftOut, Run
 from senior.report.sections import by_task
 from senior.report.tables import Cell
 

@@ -11,7 +11,7 @@ import numpy as np
 from senior.envs.metaworld import TASKS
 from senior.files import Damaged, unpack
 from senior.report.asked import Asked, asked
-from senior.report.results import LeftOut, Run, Unusable
+from senior.report.records import LeftOut, Run, Unusable
 
 Arms = Mapping[str, Sequence[Run]]
 """Runs of one task by the label of their arm."""

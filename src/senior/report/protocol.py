@@ -8,9 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from senior.report.cells import Tasks
+from senior.report.comparison import SHARED, unlike_on_one_task
 from senior.report.page import Section, Table
-from senior.report.results import PACKAGES, PROTOCOL, Arm, LeftOut, Run, unlike
-from senior.report.sections import SHARED, Tasks, unlike_on_one_task
+from senior.report.records import PACKAGES, PROTOCOL, Arm, LeftOut, Run
+from senior.report.results import unlike
 from senior.report.tables import Cell
 
 APART = ("device", "threads", "machine", "python", "git_commit", "action_size", "position")

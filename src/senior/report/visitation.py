@@ -19,7 +19,7 @@ from senior.report.looks import STYLE, Look, looks
 from senior.report.page import Drawing, Section, Table
 from senior.report.panels import colormap, panels
 from senior.report.plane import Arms, Plane, evenly, firsts, plane_of, usable, visited
-from senior.report.results import LeftOut, Run
+from senior.report.records import LeftOut, Run
 from senior.report.sections import by_task
 from senior.report.tables import Cell
 

@@ -9,7 +9,8 @@ from pathlib import Path
 from senior.config import Config, differences
 from senior.report.build import found, page_of
 from senior.report.names import normal
-from senior.report.results import LeftOut, Run, grouped
+from senior.report.records import LeftOut, Run
+from senior.report.results import grouped
 from senior.reproduce import page
 from senior.reproduce.studies import Arm, Scale, Study, Table, chosen, configuration
 from senior.sweep.cells import Cell

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
-from senior.report.results import Run
+from senior.report.records import Run
 from senior.report.statistics import Group, Interval, contrast, mean_over
 from senior.reproduce.studies import Claim, Comparison, Quantity, When
 
