@@ -46,10 +46,14 @@ OPTIONS = _OPTIONS.split()
 """What `senior train` is given for `short`."""
 
 
+def arrays_of(run: Path) -> dict[str, np.ndarray]:
+    """What the newest checkpoint holds, by name."""
+    return unpack(run / "checkpoints" / f"step-{saved_steps(run / 'checkpoints')[0]:010d}.npz")
+
+
 def progress_of(run: Path) -> dict[str, Any]:
     """What the newest checkpoint knows of a run beside its arrays."""
-    last = saved_steps(run / "checkpoints")[0]
-    return json.loads(unpack(run / "checkpoints" / f"step-{last:010d}.npz")["about"].tobytes())["progress"]
+    return json.loads(arrays_of(run)["about"].tobytes())["progress"]
 
 
 def assert_same_run(one: Path, other: Path, interrupted: bool) -> None:

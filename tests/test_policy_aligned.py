@@ -48,6 +48,17 @@ def test_half_a_batch_is_recent_while_there_is_budget():
     assert np.bincount(plain.source, minlength=3).tolist() == [64, 0, 0]
 
 
+def test_the_first_updates_after_pretraining_are_not_mixed():
+    config = small("qpa")
+    learner = make_learner(config)
+    run = learner.init(config)
+    run = run._replace(replay=run.replay._replace(count=jnp.int32(1500)))
+    _, info = jax.jit(learner.begin)(run, jnp.int32(400))
+    assert float(info["recent_share"]) == 0
+    _, info = jax.jit(learner.learn)(run, jnp.int32(401), jnp.int32(200))
+    assert float(info["recent_share"]) == 0.5
+
+
 def test_the_window_is_the_latest_episodes_long_and_closes_with_the_budget(tmp_path: Path):
     config = replace(small("qpa"), qpa=replace(small("qpa").qpa, episodes=3))
     trainee = Trainee(config, tmp_path, make_learner(config), spec_of(config))

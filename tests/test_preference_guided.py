@@ -303,6 +303,12 @@ def test_the_bonus_is_paid_from_its_first_use_on_and_enters_the_critics_reward()
     assert float(info["critic_loss"]) != float(unpaid["critic_loss"])
 
 
+def test_the_first_updates_after_pretraining_are_hybrid_and_paid():
+    _, info = jax.jit(learner_of().begin)(begun(), jnp.int32(50))
+    assert float(info["curiosity_share"]) == pytest.approx(38 / 128)
+    assert float(info["bonus_mean"]) > 1e-3
+
+
 def assert_scored(run: learner.Run) -> None:
     """Replay and curiosity buffer hold the present model's mean and population deviation, and no bonus."""
     assert run.model is not None

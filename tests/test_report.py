@@ -420,8 +420,8 @@ def test_the_summary_tells_short_runs_at_half_and_at_the_end(grid: Path):
     assert found["door-lock", "pebble"]["at 20K"] == "0.30 ± 0.14"
     assert found["door-lock", "pebble"]["at 40K"] == "0.70 ± 0.28"
     assert found["door-lock", "pebble"]["runs"] == "2"
-    assert found["door-lock", "pebble"]["area by steps"] == "0.38 ± 0.14"
-    assert found["door-lock", "sac"]["area by labels"] == ""
+    assert found["door-lock", "pebble"]["area by steps [95 %]"] == "0.38 [0.28, 0.48]"
+    assert found["door-lock", "sac"]["area by labels [95 %]"] == ""
     assert found["door-lock", "sac"]["95 % interval"] == "[1.00, 1.00]"
     assert found["door-lock", "sac"]["90 % interval of the mean"] == "[0.78, 1.00]"  # the episodes' own
     assert "they have 40,000 steps" in (grid / "one" / "index.html").read_text()

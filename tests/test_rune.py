@@ -78,3 +78,21 @@ def test_the_bonus_enters_the_critics_reward_and_no_stored_one(lived: Run):
     unpaid = make_learner(replace(CONFIG, rune=replace(CONFIG.rune, beta=0.0)))
     _, without = jax.jit(unpaid.learn)(lived, jnp.int32(500), jnp.int32(0))
     np.testing.assert_allclose(info["batch_reward"] - without["batch_reward"], info["bonus_mean"], rtol=1e-3)
+
+
+def test_pretraining_knows_no_bonus_and_the_first_updates_after_it_do(lived: Run):
+    """Updates that know the members' disagreement change with it."""
+    run, rng = LEARNER.init(CONFIG), np.random.default_rng(1)
+    store = jax.jit(LEARNER.store_pretraining)
+    for i in range(40):
+        vector = [rng.normal(size=n).astype(np.float32) for n in (4, 2, 4)]
+        fact = Fact(vector[0], vector[1], np.float32(i), vector[2], np.bool_(False), np.bool_(False), np.int32(0))
+        run, _ = store(run, fact)
+    agreeing = run._replace(replay=run.replay._replace(spread=jnp.zeros_like(run.replay.spread)))
+    assert np.asarray(run.replay.spread[:40]).min() > 0
+    pretrain, begin = jax.jit(LEARNER.pretrain), jax.jit(LEARNER.begin)
+    pretrained = [jax.tree.leaves(pretrain(one, jnp.int32(40))[0].agent) for one in (run, agreeing)]
+    assert all(np.array_equal(one, other) for one, other in zip(*pretrained, strict=True))
+    (begun, paid), (unpaid, nothing) = (begin(one, jnp.int32(40)) for one in (run, agreeing))
+    assert float(paid["bonus_mean"]) > 0 == float(nothing["bonus_mean"])
+    assert not np.array_equal(begun.agent.critics.weights[0], unpaid.agent.critics.weights[0])

@@ -89,6 +89,10 @@ def assert_share(hits: np.ndarray, probability: np.ndarray | float) -> None:
     assert abs(hits.sum() - p.sum()) <= 3 * deviation, (hits.mean(), p.mean())
 
 
+def normal_below(z: float) -> float:
+    return (1 + math.erf(z / math.sqrt(2))) / 2
+
+
 def judged(reward: np.ndarray, numbers: Numbers, average: float = 2.0) -> np.ndarray:
     """Answers as an array, NaN where a pair was skipped."""
     return np.array(judge(reward, numbers, average, np.random.default_rng(11).random((len(reward), 2))), float)
@@ -128,12 +132,31 @@ def test_the_noisy_teacher_answers_by_the_logistic_of_the_advantage():
             assert_share(second[held], expected[held])
 
 
+def test_the_teachers_own_chance_is_as_good_as_any():
+    """Through `ask`, whose numbers come from a generator for each pair."""
+    reward = random_pairs(4)
+    gap = truth(reward.astype(np.float32).astype(float))
+    right = gap > 0
+
+    def said(numbers: Numbers) -> np.ndarray:
+        teacher = Scripted(numbers, seed=5)
+        teacher.ask(list(range(1, MANY + 1)), query_of(reward))
+        return np.array(teacher.collect().labels) == Preferred.SECOND
+
+    wrong = said(TEACHERS["mistake"]) != right
+    assert_share(wrong, 0.1)
+    assert_share(wrong[1:] & wrong[:-1], 0.01)  # of neighbours: seeds that follow each other give nothing alike
+    assert_share(said(TEACHERS["noisy"]), 1 / (1 + np.exp(-gap)))
+
+
 def test_the_skipping_and_the_equal_teacher_leave_out_and_mark_exactly_what_their_thresholds_say():
     reward = random_pairs(3)
     total = reward.sum(axis=-1)
     skipped = np.isnan(judged(reward, Numbers(skip=0.8), average=2.0))
     assert np.array_equal(skipped, total.max(axis=1) <= 1.6)
     assert 1000 < skipped.sum() < MANY - 1000
+    # each of the two returns is normal with mean 4 * 0.5 and deviation 0.3 * 2, and both must stay below
+    assert_share(skipped, normal_below((1.6 - 2) / 0.6) ** 2)
     equal = judged(reward, TEACHERS["equal"], average=2.0) == Preferred.EQUAL
     assert np.array_equal(equal, np.abs(total[:, 0] - total[:, 1]) < 0.2)
     # the difference of two sums of four normals of deviation 0.3 is normal with deviation 0.3 sqrt(8)

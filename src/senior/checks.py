@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from senior.config import Config, differences
+from senior.methods import METHODS
 from senior.presets import release
 from senior.types import BadInput
 
@@ -106,6 +107,12 @@ def check(config: Config) -> Config:
         f"Method {row.name} learns from the true reward and asks nothing, so --teacher human has no use.",
     )
     until, random_steps = config.pretraining.until, config.pretraining.random_steps
+    named = METHODS.get(row.name)
+    _require(
+        not row.learns_reward or named is None or named.learns_reward,
+        f"Method {row.name} has no reward model, so --select {row.select} would be another method: name one that "
+        "learns a reward, like pebble.",
+    )
     if not row.learns_reward:
         _require(until == 0, f"Method {row.name} learns from the true reward, so --pretraining.until must be 0.")
         return config
@@ -113,6 +120,10 @@ def check(config: Config) -> Config:
         queries.budget >= queries.per_session,
         f"The budget of {queries.budget} labels is below one session of {queries.per_session}; "
         "raise --budget or lower --per-session.",
+    )
+    _require(
+        queries.pool > 1 or not asking.replace_skipped,
+        "--replace-skipped keeps as many pairs in reserve as a session asks, so --pool must be at least 2.",
     )
     _require(
         config.steps > until,

@@ -16,11 +16,16 @@ import tyro
 
 from senior.methods import Method
 from senior.preference_file import Rules
+from senior.teachers import TEACHERS
 from senior.types import BadInput
 
 _FLAT = tyro.conf.arg(name="")
 """A group whose fields are options without the group's name in front."""
 
+_TEACHER = tyro.conf.arg(
+    help=f"Who answers: {', '.join(TEACHERS)}, a file of exported labels (.jsonl), or module:Name. The oracle compares "
+    "true returns; human: people, in a browser."
+)
 
 Switch = Annotated[bool, tyro.conf.FlagConversionOff]
 """A setting that is given with its value: ``--pge.relabel False``. Plain ones are flags: ``--wait``, ``--no-wait``."""
@@ -283,9 +288,7 @@ class Config:
     """Environment steps."""
     compat: Literal["none", "release"] = "none"
     """release: m-senior as its authors' public code behaves, where that differs from the paper."""
-    teacher: str = "oracle"
-    """Who answers: oracle (compares true returns), mistake, noisy, skip, equal, myopic; human (people, in a browser);
-    a file of labels that were exported (.jsonl); or module:Name."""
+    teacher: Annotated[str, _TEACHER] = "oracle"
     answering: Annotated[Answering, _FLAT] = field(default_factory=Answering)
     asking: Annotated[Asking, _FLAT] = field(default_factory=Asking)
     env: str | None = None

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -14,17 +15,23 @@ MIXES = ("uniform", "curiosity", "recent")
 OUTER_STEPS = ("none", "bilevel")
 
 
+def _one_of(what: str, known: Iterable[str]) -> Any:
+    """An option's help, with the names that can be given."""
+    return tyro.conf.arg(help=f"{what}: {', '.join(known)}, or module:Name.")
+
+
+_SELECT = _one_of("Which pairs to ask", (*select.RULES, "none"))
+_EXPLORE = _one_of("Bonus on top of the learned reward", explore.BONUSES)
+
+
 @dataclass(frozen=True)
 class Method:
     """One row of `senior methods`; every cell is an option of `senior train`."""
 
     name: Annotated[str, tyro.conf.arg(name="method")] = "m-senior"
     """Name of the row that the cells below start from."""
-    select: str = "motion_distinction"
-    """Which pairs to ask: uniform, entropy, disagreement, kcenter, kcenter_disagreement, kcenter_entropy,
-    policy_aligned, motion_distinction, none, or module:Name."""
-    explore: str = "preference_guided"
-    """Bonus on top of the learned reward: disagreement (RUNE), preference_guided (PGE), none, or module:Name."""
+    select: Annotated[str, _SELECT] = "motion_distinction"
+    explore: Annotated[str, _EXPLORE] = "preference_guided"
     mix: str = "curiosity"
     """Where batches come from: uniform (the whole replay), curiosity (a share from PGE's curiosity buffer), recent (a
     share from the latest episodes while there is budget, QPA)."""

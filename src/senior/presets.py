@@ -14,8 +14,11 @@ from senior.config import (
     Bilevel,
     Config,
     Evaluation,
+    MotionDistinction,
     Networks,
+    PreferenceGuided,
     Pretraining,
+    Queries,
     Reward,
     differences,
 )
@@ -119,22 +122,27 @@ PRESETS = {"paper": paper, "quick": quick, "qpa_original": qpa_original}
 def release(config: Config) -> Config:
     """M-SENIOR as its authors' public code behaves where that differs from the paper (docs/methods.md).
 
-    Its selection is uniform in effect, and its bonus 2e-45 at its first use.
+    Its selection is uniform in effect, and its bonus 2e-45 at its first use. What it shares with the paper's reading is
+    set too, but for the sizes of networks, batches, buffers and schedules.
     """
+    pge = PreferenceGuided(
+        every=config.pge.every,
+        capacity=config.pge.capacity,
+        bandwidth=1.0,
+        clock="env_step",
+        equal="second",
+        relabel=False,
+        rest="older",
+        refresh_with_outer=False,
+    )
     return replace(
         config,
         compat="release",
-        mds=replace(config.mds, density_sum="log", axis="raw", scores="mirrored"),
-        pge=replace(
-            config.pge,
-            bandwidth=1.0,
-            clock="env_step",
-            equal="second",
-            relabel=False,
-            rest="older",
-            refresh_with_outer=False,
-        ),
-        bilevel=replace(config.bilevel, batch="update"),
+        queries=replace(config.queries, pool=Queries.pool),
+        reward=replace(config.reward, members=Reward.members),
+        mds=MotionDistinction(density_sum="log", axis="raw", scores="mirrored"),
+        pge=pge,
+        bilevel=Bilevel(every=config.bilevel.every, batch="update"),
     )
 
 

@@ -55,6 +55,14 @@ def estimate_and_interval(found: Intervals) -> tuple[str, str | None]:
     return number(interval.mean), bracketed(interval)
 
 
+def with_interval(found: Intervals) -> str | None:
+    """An estimate and its interval in one cell; None of nothing."""
+    told, interval = estimate_and_interval(found)
+    if math.isnan(float(found.mean[0])):
+        return None
+    return f"{told} {interval}" if interval else told
+
+
 def counted(runs: Sequence[Run]) -> Cell:
     """How many there are, and have finished."""
     done = len(finished(runs))

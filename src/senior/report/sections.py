@@ -17,25 +17,26 @@ from senior.report.cells import (
     Tasks,
     bracketed,
     counted,
+    estimate_and_interval,
     finished,
     interval_of_mean,
     listed,
     mean_of,
-    number,
     plus_minus,
     scores_at,
     span,
     tells_success,
+    with_interval,
 )
 from senior.report.looks import Look, in_order
 from senior.report.page import Drawing, Section, Table
 from senior.report.records import Run
 from senior.report.statistics import (
-    Interval,
     by_labels,
     correlation,
     interquartile_means,
     mean_over,
+    means,
     rank_correlation,
 )
 from senior.report.tables import Cell, shown
@@ -78,8 +79,8 @@ def summary(tasks: Tasks, shared: Sequence[str] = ()) -> Section:
     text = [
         "Each line is an arm: runs that differ in nothing but their seed. Numbers are means ± sample standard "
         "deviations over seeds. The 90 % interval of the mean is Student's, and never narrower than the episodes that "
-        "were judged allow; that of the interquartile mean is by the bootstrap. Areas are the mean over all steps, or "
-        "over all asked pairs."
+        "were judged allow; those of interquartile means and of areas are by the bootstrap. Areas are the mean over "
+        "all steps, or over all asked pairs."
     ]
     if shared:
         text.append(f"All arms that ask people have, beside what their names tell: {' '.join(shared)}.")
@@ -108,11 +109,15 @@ def _marks(runs: Sequence[Run]) -> tuple[int, int]:
 
 def _summary(marks: tuple[int, int], tasks: Tasks) -> Table:
     head = ("task", "arm", "runs", *(f"at {thousands(step)}" for step in marks), "90 % interval of the mean")
-    head += ("interquartile mean", "95 % interval", "area by steps", "area by labels", "labels")
+    head += ("interquartile mean", "95 % interval", "area by steps [95 %]", "area by labels [95 %]", "labels")
     rows: list[list[Cell]] = []
     for task, arms in tasks.items():
         ended = {label: done for label, runs in arms.items() if (done := finished(runs))}
         middle = interquartile_means({label: [scores_at(runs, marks[1])] for label, runs in ended.items()})
+        by_steps, by_asked = (
+            means({label: [np.array([area(run) for run in runs])] for label, runs in ended.items()})
+            for area in (_area_by_steps, _area_by_labels)
+        )
         for label, runs in arms.items():
             done = ended.get(label, [])
             cells: list[Cell] = [task, label, counted(runs), *(plus_minus(scores_at(done, step)) for step in marks)]
@@ -120,16 +125,21 @@ def _summary(marks: tuple[int, int], tasks: Tasks) -> Table:
                 rows.append([*cells, *[None] * 6])
                 continue
             cells.append(bracketed(interval_of_mean(done, marks[1])))
-            mean, low, high = (float(bound[0]) for bound in middle[label])
-            cells += [number(mean), bracketed(Interval(mean, low, high))]
-            cells.append(plus_minus([mean_over(run.evaluation.step, run.score) for run in done]))
-            cells.append(
-                plus_minus([mean_over(*by_labels(run.evaluation.queried, run.score)) for run in done if run.asks])
-            )
+            cells += estimate_and_interval(middle[label])
+            cells += [with_interval(areas[label]) for areas in (by_steps, by_asked)]
             cells.append(span([float(run.evaluation.labels[-1]) for run in done]))
             rows.append(cells)
     caption = f"At {thousands(marks[0])} and {thousands(marks[1])} steps, by task and arm."
     return Table(caption, head, rows, f"summary-{thousands(marks[1])}", len(rows) > LONG)
+
+
+def _area_by_steps(run: Run) -> float:
+    return mean_over(run.evaluation.step, run.score)
+
+
+def _area_by_labels(run: Run) -> float:
+    """NaN where nobody is asked."""
+    return mean_over(*by_labels(run.evaluation.queried, run.score)) if run.asks else math.nan
 
 
 def _as_in_the_paper(marks: tuple[int, int], tasks: Tasks) -> Table:
@@ -250,8 +260,7 @@ def every_run(tasks: Tasks) -> Table:
             for run in runs:
                 told = run.evaluation
                 cells: list[Cell] = [task, label, run.seed, *(run.score_at(step) for step in _marks([run]))]
-                cells.append(mean_over(told.step, run.score))
-                cells.append(mean_over(*by_labels(told.queried, run.score)) if run.asks else None)
+                cells += [_area_by_steps(run), _area_by_labels(run)]
                 cells += [int(told.labels[-1]), run.seconds, run.step, run.steps, str(run.path)]
                 rows.append(cells)
     head = ("task", "arm", "seed", "at 500K or half", "at 1000K or the end", "area by steps", "area by labels")
