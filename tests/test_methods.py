@@ -13,8 +13,8 @@ from senior.preferences import Preferences
 from senior.program import train
 from senior.rundir import EVAL, TRAIN
 from senior.schedule import Counts, plan
-from tests.equal import arrays_of, progress_of
-from tests.small import rows, small
+from tests.equal import arrays_of, progress_of, short
+from tests.small import preferences_dump, rows, small
 
 RANDOM_RETURN = 150.0
 """A uniformly random policy's mean true return on `point` is about 110 to 150; the most possible is near 400."""
@@ -96,6 +96,17 @@ def test_every_method_runs_as_scheduled_on_meta_world(method: str, tmp_path: Pat
     curious, recent = SHARES[config.method.mix]
     assert (float(asking["curiosity_share"]), float(asking["recent_share"])) == (curious, recent)
     assert (float(after["curiosity_share"]), float(after["recent_share"])) == (curious, 0.0)
+
+
+def test_evaluation_leaves_training_alone(tmp_path: Path):
+    """It has environments and random numbers of its own, and may begin in the middle of an episode."""
+    often, seldom = (
+        train(replace(short(), evaluation=evaluation), tmp_path / name)[0].path
+        for name, evaluation in (("often", Evaluation(every=130, episodes=3)), ("seldom", Evaluation(1000, 1)))
+    )
+    assert len(rows(often / "eval.csv")) > len(rows(seldom / "eval.csv"))
+    assert (often / "train.csv").read_bytes() == (seldom / "train.csv").read_bytes()
+    assert preferences_dump(often) == preferences_dump(seldom)
 
 
 ABLATIONS = {
