@@ -355,7 +355,18 @@ def test_returns_are_correlated_over_the_main_phase(tmp_path: Path):
     tasks = sections.by_task(read([tmp_path]).runs)
     section = sections.reward_model(tasks, looks(["pebble"]))
     assert section is not None
-    assert section.tables[0].rows[0][-2:] == ["1.00", "1.00"]
+    assert section.tables[0].rows[0][-3:-1] == ["1.00", "1.00"]
+
+
+def test_episodes_with_success_are_counted_until_the_last_session(tmp_path: Path):
+    path = evaluated(tmp_path / "run", config(), [0, 0, 0, 1])
+    head = "step,episode_return,learned_return,queried,labels,reward_accuracy,episode_success"
+    told = ["9000,1,0,0,0,,1", "10500,2,1,5,5,1,0", "11000,3,2,5,5,1,1", "15500,4,3,9,9,1,1", "16000,5,4,9,9,1,1"]
+    (path / "train.csv").write_text("\n".join([head, *told]) + "\n")
+    section = sections.reward_model(sections.by_task(read([tmp_path]).runs), looks(["pebble"]))
+    assert section is not None
+    assert section.tables[0].head[-1] == "successful episodes while asking"
+    assert section.tables[0].rows[0][-1] == "2.00"
 
 
 def test_runs_evaluated_at_other_steps_are_read_off_lines():

@@ -195,21 +195,33 @@ def reward_model(tasks: Tasks, looks: Mapping[str, Look]) -> Section | None:
                 [value for run in told if math.isfinite(value := _agreement(run, measure))]
                 for measure in (correlation, rank_correlation)
             )
+            found = [_found(run) for run in told] if tells_success(arms) else []
             if accuracy or linear:
-                rows.append([task, label, len(told), plus_minus(accuracy), plus_minus(linear), plus_minus(ranks)])
+                cells = [plus_minus(values) for values in (accuracy, linear, ranks, found)]
+                rows.append([task, label, len(told), *cells])
     if not rows:
         return None
     head = ("task", "arm", "runs", f"right of the last {across.PAIRS} pairs", "correlation", "rank correlation")
+    head += ("successful episodes while asking",)
     caption = "Prospective accuracy at the end of asking, and how learned and true return of an episode go together."
     text = (
         "Prospective accuracy is of pairs that the reward model has not seen: it judges a session's pairs before it is "
         "fitted to them. Correlations are over the episodes of the main phase, each with the return that the model of "
         "its time gave it, and are means ± standard deviations over seeds. A chosen pair may be harder than a random "
-        "one: accuracies of methods that choose differently do not rank their reward models."
+        "one: accuracies of methods that choose differently do not rank their reward models. Nobody can be "
+        "asked about what was never reached: the last column counts the training episodes with success before the last "
+        "session."
     )
     return Section(
         "Reward model", (text,), (Table(caption, head, rows, "reward-model", len(rows) > LONG),), tuple(figures)
     )
+
+
+def _found(run: Run) -> int:
+    """Training episodes with success before the last session."""
+    assert run.episodes is not None
+    told = run.episodes
+    return int(((told.queried < told.queried[-1]) & (told.episode_success > 0)).sum())
 
 
 def _agreement(run: Run, measure: Callable[[np.ndarray, np.ndarray], float]) -> float:
