@@ -171,7 +171,7 @@ def accuracy_curves(task: str, arms: Runs, looks: Mapping[str, Look]) -> Drawing
     curves = {label: found for label, found in curves.items() if len(found[0])}
     if not curves:
         return None
-    frame = Frame(task, STEPS, "prospective accuracy", _last(arms), level=0.5)
+    frame = Frame(task, STEPS, "prospective accuracy", 1.02 * max(steps[-1] for steps, _ in curves.values()), level=0.5)
     caption = (
         f"{task}: share of the latest {PAIRS} asked pairs that the reward model judged rightly before it was fitted to "
         "them; mean and standard deviation over seeds. Dotted: chance."
@@ -212,12 +212,9 @@ def measure(arms: Runs) -> str:
     return "success rate" if tells_success(arms) else "true return"
 
 
-def _last(arms: Runs) -> int:
-    return max(run.steps for runs in arms.values() for run in runs)
-
-
 def _over_steps(task: str, arms: Runs) -> Frame:
-    return Frame(task, STEPS, measure(arms), _last(arms), tells_success(arms))
+    last = max(run.steps for runs in arms.values() for run in runs)
+    return Frame(task, STEPS, measure(arms), last, tells_success(arms))
 
 
 def _deviations(curves: Mapping[str, Curve]) -> dict[str, Band]:
