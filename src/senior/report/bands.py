@@ -19,6 +19,8 @@ MOST = 4
 """Bands in one axis; where there are more, nobody can tell them apart."""
 ACROSS = 4
 """Panels in a line."""
+FEW = 40
+"""Points of a grey curve."""
 GREY = "#8a8f96"
 
 P = ParamSpec("P")
@@ -86,7 +88,8 @@ def banded(
         for label, axis in panels.items():
             for other, band in bands.items():
                 if other != label:
-                    axis.plot(band.x, band.middle, color=GREY, linewidth=0.7, alpha=0.5)
+                    some = _evenly(len(band.x))
+                    axis.plot(band.x[some], band.middle[some], color=GREY, linewidth=0.7, alpha=0.5)
             _draw(axis, label, bands[label], looks[label], lines.get(label, ()))
         return figure
     figure, axis = canvas(list(bands))
@@ -118,6 +121,11 @@ def grid(titles: Mapping[str, str], frame: Frame) -> tuple[Figure, dict[str, Axe
     figure.supxlabel(frame.x, fontsize=9)
     figure.supylabel(frame.y, fontsize=9)
     return figure, panels
+
+
+def _evenly(points: int) -> np.ndarray:
+    """Places of `FEW` points at most, the first and the last among them."""
+    return np.unique(np.linspace(0, points - 1, min(points, FEW)).round().astype(int))
 
 
 def thousands(value: float, place: int | None = None) -> str:
