@@ -367,6 +367,12 @@ def test_episodes_with_success_are_counted_until_the_last_session(tmp_path: Path
     assert section is not None
     assert section.tables[0].head[-1] == "successful episodes while asking"
     assert section.tables[0].rows[0][-1] == "2.00"
+    (path / "train.csv").write_text("\n".join([head, *(line[:-1] for line in told)]) + "\n")
+    section = sections.reward_model(sections.by_task(read([tmp_path]).runs), looks(["pebble"]))
+    assert section is not None
+    assert section.tables[0].rows[0][-1] is None  # not told is not none
+    (path / "train.csv").write_text(head + "\n")
+    assert sections.reward_model(sections.by_task(read([tmp_path]).runs), looks(["pebble"])) is None
 
 
 def test_runs_evaluated_at_other_steps_are_read_off_lines():

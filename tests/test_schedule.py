@@ -73,6 +73,20 @@ TABLE = {
 }
 
 
+def test_the_rows_are_those_of_the_papers():
+    cells = {name: (row.select, row.explore, row.mix, row.outer) for name, row in METHODS.items()}
+    assert cells == {
+        "sac": ("none", "none", "uniform", "none"),
+        "pebble": ("entropy", "none", "uniform", "none"),
+        "mrn": ("disagreement", "none", "uniform", "bilevel"),
+        "rune": ("disagreement", "disagreement", "uniform", "none"),
+        "m-rune": ("disagreement", "disagreement", "uniform", "bilevel"),
+        "qpa": ("policy_aligned", "none", "recent", "none"),
+        "p-senior": ("motion_distinction", "preference_guided", "curiosity", "none"),
+        "m-senior": ("motion_distinction", "preference_guided", "curiosity", "bilevel"),
+    }
+
+
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("name", ["paper", "qpa_original"])
 @pytest.mark.parametrize("task", TABLE)
@@ -105,7 +119,7 @@ def test_sessions_queries_outer_steps_and_refreshes_of_a_million_steps(task: str
     assert (networks.layers, networks.width, sac.batch) == ((2, 1024, 1024) if original else (3, 256, 512))
     rates = (sac.actor_rate, sac.critic_rate, sac.alpha_rate)
     assert rates == ((1e-4, 1e-4, 1e-4) if original else (3e-4, 3e-4, 1e-4))
-    assert config.evaluation.episodes == (100 if original else 10)
+    assert (config.evaluation.every, config.evaluation.episodes) == (10_000, 100 if original else 10)
     assert set(TABLE) == set(PAPER)
 
 

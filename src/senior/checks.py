@@ -102,17 +102,14 @@ def check(config: Config) -> Config:
     )
     _require(0 <= asking.settle < 3600, f"--settle must be 0 or more seconds, below an hour, not {asking.settle}.")
     row.check()
+    if row.name in METHODS and METHODS[row.name].learns_reward != row.learns_reward:
+        learns = "learns a reward, like pebble" if row.learns_reward else "learns from the true reward: sac"
+        raise BadInput(f"With --select {row.select} method {row.name} would be another one; name one that {learns}.")
     _require(
         row.learns_reward or not people,
         f"Method {row.name} learns from the true reward and asks nothing, so --teacher human has no use.",
     )
     until, random_steps = config.pretraining.until, config.pretraining.random_steps
-    named = METHODS.get(row.name)
-    _require(
-        not row.learns_reward or named is None or named.learns_reward,
-        f"Method {row.name} has no reward model, so --select {row.select} would be another method: name one that "
-        "learns a reward, like pebble.",
-    )
     if not row.learns_reward:
         _require(until == 0, f"Method {row.name} learns from the true reward, so --pretraining.until must be 0.")
         return config

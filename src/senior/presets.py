@@ -122,8 +122,8 @@ PRESETS = {"paper": paper, "quick": quick, "qpa_original": qpa_original}
 def release(config: Config) -> Config:
     """M-SENIOR as its authors' public code behaves where that differs from the paper (docs/methods.md).
 
-    Its selection is uniform in effect, and its bonus 2e-45 at its first use. What it shares with the paper's reading is
-    set too, but for the sizes of networks, batches, buffers and schedules.
+    Its selection is uniform in effect, and its bonus 2e-45 at its first use. What it shares with the paper's reading in
+    MDS, PGE, the outer step, the pool and the ensemble is set too, but for sizes and schedules (Q, N, capacities).
     """
     pge = PreferenceGuided(
         every=config.pge.every,

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from senior.report.looks import STYLE, WIDTH, Look, canvas, legend, wrapped
+from senior.report.plane import evenly
 
 MOST = 4
 """Bands in one axis; where there are more, nobody can tell them apart."""
@@ -81,14 +82,14 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 def banded(
     bands: Mapping[str, Band], looks: Mapping[str, Look], frame: Frame, thin: Mapping[str, Sequence[Line]] | None = None
 ) -> Figure:
-    """Curves by label; more than `MOST` have a panel each, in which the others are grey. ``thin``: lines of runs."""
+    """Curves by label; more than `MOST` have a panel each, with the others in grey (`FEW` points). ``thin``: runs."""
     lines = thin or {}
     if len(bands) > MOST:
         figure, panels = grid({label: label for label in bands}, frame)
         for label, axis in panels.items():
             for other, band in bands.items():
                 if other != label:
-                    some = _evenly(len(band.x))
+                    some = evenly(range(len(band.x)), FEW)
                     axis.plot(band.x[some], band.middle[some], color=GREY, linewidth=0.7, alpha=0.5)
             _draw(axis, label, bands[label], looks[label], lines.get(label, ()))
         return figure
@@ -121,11 +122,6 @@ def grid(titles: Mapping[str, str], frame: Frame) -> tuple[Figure, dict[str, Axe
     figure.supxlabel(frame.x, fontsize=9)
     figure.supylabel(frame.y, fontsize=9)
     return figure, panels
-
-
-def _evenly(points: int) -> np.ndarray:
-    """Places of `FEW` points at most, the first and the last among them."""
-    return np.unique(np.linspace(0, points - 1, min(points, FEW)).round().astype(int))
 
 
 def thousands(value: float, place: int | None = None) -> str:

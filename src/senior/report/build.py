@@ -37,7 +37,7 @@ def report(places: Sequence[Path], out: Path, first: Sequence[Section] = (), unf
     """Read all runs at or below ``places`` and write the page, its figures and tables into ``out``.
 
     first: sections that stand before all others. unfinished: show runs under way too, in curves as far as they have
-    come; tables are of finished runs alone.
+    come; tables of success are of finished runs alone.
 
     Raises `BadInput` if there is no run with an evaluation, if ``out`` cannot be written, or if what draws the page is
     not installed.

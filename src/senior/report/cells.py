@@ -57,9 +57,9 @@ def estimate_and_interval(found: Intervals) -> tuple[str, str | None]:
 
 def with_interval(found: Intervals) -> str | None:
     """An estimate and its interval in one cell; None of nothing."""
-    told, interval = estimate_and_interval(found)
     if math.isnan(float(found.mean[0])):
         return None
+    told, interval = estimate_and_interval(found)
     return f"{told} {interval}" if interval else told
 
 

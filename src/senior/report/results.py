@@ -61,9 +61,6 @@ def _order(run: Run) -> tuple[Any, ...]:
     return run.arm.task, run.arm.label, run.arm.fingerprint, run.seed
 
 
-# Finding.
-
-
 def _found(places: Sequence[Path], left_out: list[LeftOut]) -> Iterator[Path]:
     seen: set[Path] = set()
     for place in places:
@@ -93,9 +90,6 @@ def _below(place: Path, seen: set[Path], left_out: list[LeftOut]) -> Iterator[Pa
         return
     for child in children:
         yield from _below(child, seen, left_out)
-
-
-# Sorting out.
 
 
 def _of_one_measure(runs: list[Run], left_out: list[LeftOut]) -> list[Run]:

@@ -1,6 +1,6 @@
-"""The parts of a report that compare arms: what they reach, how fast, from how many labels, and at what cost.
+"""The parts of a report that tell arm by arm: what is reached, how fast, from how many labels, and at what cost.
 
-Numbers in tables are of finished runs. Imports no JAX.
+Imports no JAX.
 """
 
 from __future__ import annotations
@@ -55,9 +55,6 @@ def by_task(runs: Sequence[Run]) -> dict[str, dict[str, list[Run]]]:
     return {task: {label: found[task][label] for label in in_order(found[task])} for task in sorted(found)}
 
 
-# What is reached.
-
-
 def summary(tasks: Tasks, shared: Sequence[str] = ()) -> Section:
     """Success at two steps, intervals and areas, a line per arm; with several tasks, the paper's table too.
 
@@ -95,7 +92,7 @@ def summary(tasks: Tasks, shared: Sequence[str] = ()) -> Section:
         text.append(f"No success is told by {listed(silent)}; numbers there are mean true returns of an episode.")
     if under_way:
         text.append(
-            "Under way, in the curves and not in the tables: "
+            "Under way, in the curves and not in the tables of success: "
             + listed([f"seed {run.seed} of {run.arm} at step {run.step:,} of {run.steps:,}" for run in under_way])
             + "."
         )
@@ -156,9 +153,6 @@ def _as_in_the_paper(marks: tuple[int, int], tasks: Tasks) -> Table:
     return Table("Mean success rates as the paper's table has them.", head, rows, f"rates-{thousands(marks[1])}")
 
 
-# Curves.
-
-
 def curves(tasks: Tasks, looks: Mapping[str, Look]) -> Section:
     """Learning curves per task, in three ways."""
     figures: list[Drawing] = []
@@ -180,9 +174,6 @@ def labels(tasks: Tasks, looks: Mapping[str, Look]) -> Section | None:
     return Section("Success against labels", (text,), (), tuple(figures))
 
 
-# The reward model.
-
-
 def reward_model(tasks: Tasks, looks: Mapping[str, Look]) -> Section | None:
     """How well rewards are learned; None where no run tells."""
     figures = [drawing for task, arms in tasks.items() if (drawing := across.accuracy_curves(task, arms, looks))]
@@ -195,7 +186,7 @@ def reward_model(tasks: Tasks, looks: Mapping[str, Look]) -> Section | None:
                 [value for run in told if math.isfinite(value := _agreement(run, measure))]
                 for measure in (correlation, rank_correlation)
             )
-            found = [_found(run) for run in told] if tells_success(arms) else []
+            found = [count for run in told if (count := _found(run)) is not None]
             if accuracy or linear:
                 cells = [plus_minus(values) for values in (accuracy, linear, ranks, found)]
                 rows.append([task, label, len(told), *cells])
@@ -217,11 +208,15 @@ def reward_model(tasks: Tasks, looks: Mapping[str, Look]) -> Section | None:
     )
 
 
-def _found(run: Run) -> int:
-    """Training episodes with success before the last session."""
+def _found(run: Run) -> int | None:
+    """Training episodes with success before the last session; None where it is not told."""
     assert run.episodes is not None
     told = run.episodes
-    return int(((told.queried < told.queried[-1]) & (told.episode_success > 0)).sum())
+    known = np.isfinite(told.queried) & np.isfinite(told.episode_success)
+    if not known.any():
+        return None
+    asking = told.queried < np.nanmax(told.queried)
+    return int((known & asking & (told.episode_success > 0)).sum())
 
 
 def _agreement(run: Run, measure: Callable[[np.ndarray, np.ndarray], float]) -> float:
@@ -230,9 +225,6 @@ def _agreement(run: Run, measure: Callable[[np.ndarray, np.ndarray], float]) -> 
     told = run.episodes
     main = (told.step > run.main_phase) & np.isfinite(told.learned_return) & np.isfinite(told.episode_return)
     return measure(told.learned_return[main], told.episode_return[main])
-
-
-# The cost.
 
 
 def cost(tasks: Tasks) -> Section:

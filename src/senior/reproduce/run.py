@@ -53,7 +53,7 @@ def runs_by_arm(
     """Of finished ``runs`` those below ``out`` by arm and task, and in sentences what is there and does not count.
 
     Runs count that were trained with the configuration of that arm, task and scale, and of those the most that agree in
-    all that a number depends on (`senior.report.results.Arm`).
+    all that a number depends on (`senior.report.records.Arm`).
     """
     there: dict[Path, list[Run]] = {}
     for run in runs:
