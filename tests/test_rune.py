@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -45,16 +47,19 @@ def test_the_bonus_is_the_deviation_times_a_weight_that_decays_with_the_environm
     np.testing.assert_allclose([told["beta"], told["intrinsic_mean"]], [weight, 0.5 / 3], rtol=1e-5, atol=1e-40)
 
 
-@pytest.fixture(scope="module")
-def lived() -> Run:
-    """A run with facts, scored by its model."""
-    run, rng = LEARNER.init(CONFIG), np.random.default_rng(0)
-    store = jax.jit(LEARNER.store)
-    for i in range(60):
+def with_facts(store: Callable[..., Any], facts: int, seed: int) -> Run:
+    """A run with so many facts, scored by its model."""
+    run, rng, store = LEARNER.init(CONFIG), np.random.default_rng(seed), jax.jit(store)
+    for i in range(facts):
         vector = [rng.normal(size=n).astype(np.float32) for n in (4, 2, 4)]
         fact = Fact(vector[0], vector[1], np.float32(i), vector[2], np.bool_(False), np.bool_(False), np.int32(0))
         run, _ = store(run, fact)
     return run
+
+
+@pytest.fixture(scope="module")
+def lived() -> Run:
+    return with_facts(LEARNER.store, 60, 0)
 
 
 def test_members_that_agree_pay_nothing_and_others_their_population_deviation(lived: Run):
@@ -80,14 +85,9 @@ def test_the_bonus_enters_the_critics_reward_and_no_stored_one(lived: Run):
     np.testing.assert_allclose(info["batch_reward"] - without["batch_reward"], info["bonus_mean"], rtol=1e-3)
 
 
-def test_pretraining_knows_no_bonus_and_the_first_updates_after_it_do(lived: Run):
+def test_pretraining_knows_no_bonus_and_the_first_updates_after_it_do():
     """Updates that know the members' disagreement change with it."""
-    run, rng = LEARNER.init(CONFIG), np.random.default_rng(1)
-    store = jax.jit(LEARNER.store_pretraining)
-    for i in range(40):
-        vector = [rng.normal(size=n).astype(np.float32) for n in (4, 2, 4)]
-        fact = Fact(vector[0], vector[1], np.float32(i), vector[2], np.bool_(False), np.bool_(False), np.int32(0))
-        run, _ = store(run, fact)
+    run = with_facts(LEARNER.store_pretraining, 40, 1)
     agreeing = run._replace(replay=run.replay._replace(spread=jnp.zeros_like(run.replay.spread)))
     assert np.asarray(run.replay.spread[:40]).min() > 0
     pretrain, begin = jax.jit(LEARNER.pretrain), jax.jit(LEARNER.begin)

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from senior.report.bands import Band, Frame, Line, banded, grid, styled
+from senior.report.bands import Band, Curve, Frame, banded, grid, styled
 from senior.report.cells import tells_success
 from senior.report.looks import Look, in_order
 from senior.report.looks import looks as looks_of
@@ -25,8 +25,6 @@ from senior.report.tables import Cell
 
 Runs = Mapping[str, Sequence[Run]]
 """Runs by the label of their arm."""
-Curve = tuple[np.ndarray, np.ndarray]
-"""Where ``[points]`` and what ``[points]``, or ``[runs, points]`` of several runs."""
 PAIRS = 50
 """Latest asked pairs over which prospective accuracy is taken."""
 STEPS = "environment steps"
@@ -81,7 +79,7 @@ def mean_curves(task: str, arms: Runs, looks: Mapping[str, Look]) -> Drawing:
     """Mean and standard deviation over seeds against steps, as in the paper; where runs are under way, they too."""
     curves = {label: together([against_steps(run) for run in runs]) for label, runs in arms.items()}
     thin = {
-        label: [Line(*against_steps(run)) for run in runs]
+        label: [against_steps(run) for run in runs]
         for label, runs in arms.items()
         if not all(run.finished for run in runs)
     }

@@ -24,6 +24,9 @@ FEW = 40
 """Points of a grey curve."""
 GREY = "#8a8f96"
 
+Curve = tuple[np.ndarray, np.ndarray]
+"""Where ``[points]`` and what ``[points]``, or ``[runs, points]`` of several runs."""
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -35,13 +38,6 @@ class Band(NamedTuple):
     middle: np.ndarray
     low: np.ndarray
     high: np.ndarray
-
-
-class Line(NamedTuple):
-    """A thin line, of one run."""
-
-    x: np.ndarray
-    y: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -80,17 +76,21 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 def banded(
-    bands: Mapping[str, Band], looks: Mapping[str, Look], frame: Frame, thin: Mapping[str, Sequence[Line]] | None = None
+    bands: Mapping[str, Band],
+    looks: Mapping[str, Look],
+    frame: Frame,
+    thin: Mapping[str, Sequence[Curve]] | None = None,
 ) -> Figure:
     """Curves by label; more than `MOST` have a panel each, with the others in grey (`FEW` points). ``thin``: runs."""
     lines = thin or {}
     if len(bands) > MOST:
         figure, panels = grid({label: label for label in bands}, frame)
+        some = {label: evenly(range(len(band.x)), FEW) for label, band in bands.items()}
+        grey = {label: (band.x[some[label]], band.middle[some[label]]) for label, band in bands.items()}
         for label, axis in panels.items():
-            for other, band in bands.items():
+            for other, (x, y) in grey.items():
                 if other != label:
-                    some = evenly(range(len(band.x)), FEW)
-                    axis.plot(band.x[some], band.middle[some], color=GREY, linewidth=0.7, alpha=0.5)
+                    axis.plot(x, y, color=GREY, linewidth=0.7, alpha=0.5)
             _draw(axis, label, bands[label], looks[label], lines.get(label, ()))
         return figure
     figure, axis = canvas(list(bands))
@@ -131,11 +131,11 @@ def thousands(value: float, place: int | None = None) -> str:
     return f"{value / 1000:g}K"
 
 
-def _draw(axis: Axes, label: str, band: Band, look: Look, lines: Sequence[Line]) -> None:
+def _draw(axis: Axes, label: str, band: Band, look: Look, lines: Sequence[Curve]) -> None:
     every = max(1, len(band.x) // 8)
     [line] = axis.plot(band.x, band.middle, color=look.colour, linestyle=look.line, marker=look.marker, markevery=every)
     line.set_label(label if not label.startswith("_") else f" {label}")  # it would not be told
     if np.isfinite(band.low).any():
         axis.fill_between(band.x, band.low, band.high, color=look.colour, alpha=0.18, linewidth=0)
-    for run in lines:
-        axis.plot(run.x, run.y, color=look.colour, linewidth=0.7, alpha=0.5)
+    for x, y in lines:
+        axis.plot(x, y, color=look.colour, linewidth=0.7, alpha=0.5)
