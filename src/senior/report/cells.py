@@ -46,12 +46,12 @@ def interval_of_mean(runs: Sequence[Run], step: int) -> Interval | None:
 
 def single(found: Mapping[str, Intervals]) -> dict[str, Interval]:
     """By label, of intervals that hold one point each."""
-    return {label: Interval(*(float(bound[0]) for bound in own)) for label, own in found.items()}
+    return {label: own.first() for label, own in found.items()}
 
 
 def estimate_and_interval(found: Intervals) -> tuple[str, str | None]:
     """An estimate, and its interval."""
-    interval = Interval(*(float(bound[0]) for bound in found))
+    interval = found.first()
     return number(interval.mean), bracketed(interval)
 
 

@@ -48,6 +48,10 @@ class Intervals(NamedTuple):
     low: np.ndarray
     high: np.ndarray
 
+    def first(self) -> Interval:
+        """Of the first thing, where there is one alone."""
+        return Interval(*(float(bound[0]) for bound in self))
+
 
 # Few seeds, and episodes that are counted.
 
@@ -165,8 +169,7 @@ def improvement(scores: Mapping[str, Scores]) -> dict[tuple[str, str], Interval]
     found = _estimates({f"{i}": (scores[one], scores[other]) for i, (one, other) in enumerate(pairs)}, _improvement)
     both: dict[tuple[str, str], Interval] = {}
     for pair, estimate in zip(pairs, found.values(), strict=True):
-        mean, low, high = (float(bound[0]) for bound in estimate)
-        both[pair] = Interval(mean, low, high)
+        mean, low, high = both[pair] = estimate.first()
         both[pair[1], pair[0]] = Interval(1 - mean, 1 - high, 1 - low)
     return both
 
