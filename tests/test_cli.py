@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import signal
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import senior
 from senior import envs, judgement, program
 from senior.cli import COMMANDS, main
 from senior.cli.shared import BAD_INPUT, DONE, FAILED
@@ -350,6 +353,20 @@ def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str])
         main([command, "--help"])
     assert not end.value.code
     assert f"usage: senior {command}" in capsys.readouterr().out
+
+
+def test_what_is_said_of_an_option_breaks_its_lines_where_a_clause_ends():
+    """``--help`` keeps the line breaks of what stands under a field."""
+    seen, root = 0, Path(senior.__file__).parent
+    for path in (root / "config.py", root / "methods.py", *(root / "cli").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            for field, said in pairwise(node.body if isinstance(node, ast.ClassDef) else ()):
+                match field, said:
+                    case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                        lines = text.strip().splitlines()
+                        assert all(line.endswith((".", ":", ";")) for line in lines if line), f"{path.name}: {name}"
+                        seen += 1
+    assert seen > 100
 
 
 def test_help_of_train_tells_what_quick_changes_and_the_defaults_of_the_preset(capsys: pytest.CaptureFixture[str]):

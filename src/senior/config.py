@@ -65,8 +65,8 @@ class SAC:
     alpha_rate: float = 1e-4
     """Adam's learning rate for the temperature."""
     rate_end: float = 1.0
-    """Factor on the actor's and critics' learning rates at the last step, reached along a straight line from the end
-    of pre-training. 1: constant, as in the papers."""
+    """Factor on actor's and critics' learning rates at the last step, reached linearly from the end of pre-training.
+    1: constant, as in the papers."""
     discount: float = 0.99
     """Discount gamma."""
     tau: float = 0.005
@@ -112,8 +112,8 @@ class Reward:
     stop_accuracy: float = 0.97
     """A session's fit ends after an epoch with more training accuracy than this."""
     standardise: Switch = False
-    """Bring every entry of the observation to mean 0 and deviation 1 (over the replay, taken anew for every fit; within
-    10, and what hardly varies stays small) before the reward model sees it. The papers do not."""
+    """Bring each entry of the observation to mean 0 and deviation 1, of the replay at each fit, for the reward model.
+    Kept within 10, and what hardly varies stays small. The papers do not."""
     snippets: int = 0
     """Random windows that stand for each pair in a fit (QPA's data augmentation, tau). 0: the whole segments."""
     snippet_min: int = 35
@@ -135,8 +135,8 @@ class Queries:
     segment: int = 50
     """Steps of a segment (H)."""
     episodes: Annotated[int, _flag("candidate-episodes")] = 100
-    """How many of the latest complete episodes that are longer than a segment pairs are cut from. With --select
-    policy_aligned it is --qpa.episodes instead."""
+    """How many of the latest complete episodes that are longer than a segment pairs are cut from.
+    With --select policy_aligned it is --qpa.episodes instead."""
     pool: int = 10
     """Candidate pairs per asked pair: the pool p has this times M pairs."""
 
@@ -176,13 +176,14 @@ class PreferenceGuided:
     clock: Annotated[Literal["refresh", "env_step", "since_pretrain"], _flag("beta-clock")] = "refresh"
     """What t counts in beta_t: refreshes, environment steps, or steps since pre-training."""
     equal: Literal["left_out", "second"] = "left_out"
-    """What a pair called equal adds to the preferred positions: nothing while there are others, or its second segment
-    (public code)."""
+    """What a pair called equal adds to the preferred positions.
+    left_out: nothing, while there are others. second: its second segment (public code)."""
     relabel: Switch = True
     """Score the curiosity buffer's rows anew whenever the replay is. The public code keeps them as they were drawn."""
     rest: Literal["all", "older"] = "all"
-    """Rows that fill the batch up: from all of the replay, or, rounded down, from those older than the last refresh
-    that are not in the curiosity buffer (public code)."""
+    """Rows that fill the batch up.
+    all: of the whole replay.
+    older: rounded down, of what is older than the last refresh and not in the curiosity buffer (public code)."""
     refresh_with_outer: Switch = True
     """Refresh at steps with an outer step too. The public code leaves those refreshes out."""
 
@@ -200,8 +201,8 @@ class Bilevel:
     after_budget: Switch = False
     """Go on with outer steps when the budget is spent (the paper's Algorithm 1 read literally)."""
     batch: Literal["uniform", "update"] = "uniform"
-    """Batch of the inner step: one of its own from the whole replay (Algorithm 1), or that of the step's update
-    (public code)."""
+    """Batch of the inner step.
+    uniform: one of its own from the whole replay (Algorithm 1). update: that of the step's update (public code)."""
 
 
 @dataclass(frozen=True)

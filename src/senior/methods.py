@@ -33,8 +33,8 @@ class Method:
     select: Annotated[str, _SELECT] = "motion_distinction"
     explore: Annotated[str, _EXPLORE] = "preference_guided"
     mix: str = "curiosity"
-    """Where batches come from: uniform (the whole replay), curiosity (a share from PGE's curiosity buffer), recent (a
-    share from the latest episodes while there is budget, QPA)."""
+    """Where batches come from: uniform, the whole replay; curiosity, a share of them from PGE's curiosity buffer;
+    recent, a share of them from the latest episodes while there is budget (QPA)."""
     outer: str = "bilevel"
     """Outer step on the reward model: bilevel (Meta-Reward-Net), none."""
 

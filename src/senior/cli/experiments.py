@@ -37,8 +37,8 @@ class SweepOptions:
     jobs: int | None = None
     """Workers on this machine. Left out: one per processor on a CPU, one on a GPU."""
     ray: str | None = None
-    """Address of a Ray cluster to train on, HOST:PORT or auto, instead of this machine. OUT must be a folder that all
-    its machines share."""
+    """Address of a Ray cluster to train on, HOST:PORT or auto, instead of this machine.
+    OUT must be a folder that all its machines share."""
     list: bool = False
     """Only list the cells and where they stand."""
 
@@ -101,8 +101,8 @@ class ReproduceOptions:
     paper: tyro.conf.Positional[Literal["senior"]]
     """Which paper: senior."""
     table: tuple[Literal["main", "feedback", "ablation", "quality"], ...] = ("main",)
-    """Its studies: main (Fig. 4, Table I), feedback (Fig. 5), ablation (Fig. 6), quality (Fig. 7). What several of them
-    train is trained once."""
+    """Its studies: main (Fig. 4, Table I), feedback (Fig. 5), ablation (Fig. 6), quality (Fig. 7).
+    What several of them train is trained once."""
     scale: Literal["paper", "quick", "smoke"] = "paper"
     """paper: the paper's numbers. quick: the preset quick, for a CPU, for 100,000 steps. smoke: toy sizes."""
     tasks: tuple[str, ...] = ()

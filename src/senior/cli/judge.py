@@ -40,8 +40,8 @@ class BenchOptions:
     runs: tuple[int, ...] = (1,)
     """Runs in the program; several numbers are measured one after the other."""
     environments: int | None = None
-    """Only step so many environments of the task, without learning: stock, here, and in worker processes. Of the other
-    options --task and --json are used then."""
+    """Only step so many environments of the task, without learning: stock, here, and in worker processes.
+    Of the other options --task and --json are used then."""
     device: str = "auto"
     """auto, cpu or gpu."""
     precision: Literal["float32", "bfloat16"] = "float32"
