@@ -398,6 +398,7 @@ def test_a_few_bands_share_an_axis_and_more_have_a_panel_each(bands: int):
         assert len(axis.lines) == bands  # the others' too, for comparison
     assert sum(len(axis.collections) for axis in axes) == bands
     if bands > MOST:
+        assert "grey" in figure.get_supxlabel()
         for label, axis in zip(labels, axes, strict=True):
             assert axis.get_title() == label
             assert [line.get_color() for line in axis.lines].count(looks(labels)[label].colour) == 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from typing import NamedTuple, ParamSpec, TypeVar
 
@@ -84,7 +84,8 @@ def banded(
     """Curves by label; more than `MOST` have a panel each, with the others in grey (`FEW` points). ``thin``: runs."""
     lines = thin or {}
     if len(bands) > MOST:
-        figure, panels = grid({label: label for label in bands}, frame)
+        told = replace(frame, x=f"{frame.x} (grey: the other panels' curves)")
+        figure, panels = grid({label: label for label in bands}, told)
         some = {label: evenly(range(len(band.x)), FEW) for label, band in bands.items()}
         grey = {label: (band.x[some[label]], band.middle[some[label]]) for label, band in bands.items()}
         for label, axis in panels.items():

@@ -1,9 +1,7 @@
 """One run directory as data: what it is, what it scored, and what its numbers depend on.
 
-An *arm* is what is averaged over seeds. Runs are of one arm where the task, the method with its options, and all else
-that a number depends on agree, their *fingerprint*: the whole configuration but seed, device, checkpoints and
-snapshots; and of the protocol the reward function's version, the horizon, the observation's size and the versions of
-senior-rl, metaworld and mujoco. Processor, threads, device, commit and other packages are told and keep nothing apart.
+An *arm* is what is averaged over seeds: runs of one task and method with its options, whose *fingerprint* agrees, which
+holds all else that a number depends on (`APART`, `PROTOCOL` and `PACKAGES`; docs/report.md says what it leaves out).
 
 Imports no JAX.
 """
