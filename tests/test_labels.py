@@ -305,10 +305,10 @@ def test_labels_are_put_only_where_nothing_was_asked(file: Path, tmp_path: Path)
 
 @pytest.mark.parametrize("shape", [(H + 1, O, A), (H, O - 1, A), (H, O, A + 1)])
 def test_segments_of_another_size_are_refused(file: Path, tmp_path: Path, shape: tuple[int, int, int]):
-    assert pairs_in(file, (H, O, A)) == 3
+    assert pairs_in(file, shape=(H, O, A)) == 3
     told = f"holds segments of 3 steps, with 4 numbers of an observation and 2 of an action; the run's have {shape[0]}"
     with pytest.raises(BadInput, match=told):
-        pairs_in(file, shape)
+        pairs_in(file, shape=shape)
     with closing(Preferences(tmp_path / "p.sqlite", 9, *shape)) as preferences, pytest.raises(BadInput, match=told):
         import_labels(file, preferences, 1)
 
@@ -603,6 +603,18 @@ def test_labels_are_put_into_a_run_of_people_that_has_asked_nothing(file: Path, 
     with opened(other) as preferences:
         assert preferences.session(0) == [1, 2, 3] and preferences.ready(0, 9, Rules())
     with pytest.raises(BadInput, match="holds pairs already"):
+        import_into(other, file)
+
+
+def test_labels_of_another_environment_are_refused(file: Path, tmp_path: Path):
+    """Tasks of one simulator have observations of one size."""
+    held = read(file).header["environment"]
+    assert pairs_in(file, held) == 3
+    told = rf"labels\.jsonl holds labels of {held}, and the run is on door-open\."
+    with pytest.raises(BadInput, match=told):
+        pairs_in(file, "door-open")
+    other = made(tmp_path / "other", replace(configured(per_session=3), task="door-open"))
+    with pytest.raises(BadInput, match=told):
         import_into(other, file)
 
 

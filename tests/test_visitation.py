@@ -391,8 +391,11 @@ def test_the_size_of_the_bonus_stands_beside_that_of_the_learned_reward(tmp_path
     assert [row[0] for row in table.rows] == ["m-rune"]
     expected = ["m-rune", 2, 0.05, 0.01, 0.002, 0.2, 0.01]
     assert list(table.rows[0]) == [value if isinstance(value, str) else pytest.approx(value) for value in expected]
-    told = {row["step"]: row["bonus"] for row in rows_of(drawing) if row["bonus"] == row["bonus"]}
-    assert list(told.values()) == pytest.approx([0.004, 0.002, 0])
+    assert [row["bonus"] for row in rows_of(drawing)] == pytest.approx([0.004, 0.002, 0])  # and no gaps between them
+    (axis,) = drawing.figure.axes
+    assert np.asarray(axis.lines[0].get_ydata()).tolist()[:2] == pytest.approx([0.004, 0.002])
+    drawing.figure.canvas.draw()
+    assert not any("$" in tick.label1.get_text() for tick in (*axis.yaxis.majorTicks, *axis.yaxis.minorTicks))
     section = visitation.section(runs)
     assert section is not None and [drawing.name for drawing in section.figures] == ["door-lock-bonus-size"]
 

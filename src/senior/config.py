@@ -323,6 +323,11 @@ class Config:
     """Number format of the products in actor and critics. bfloat16 is not offered (results/precision)."""
 
     @property
+    def environment(self) -> str:
+        """The task, or what was given as ``--env``."""
+        return self.env or self.task
+
+    @property
     def window(self) -> int:
         """How many of the latest complete episodes candidate pairs are cut from."""
         return self.qpa.episodes if self.method.select == "policy_aligned" else self.queries.episodes

@@ -35,7 +35,8 @@ def check_fit(config: Config, spec: EnvSpec) -> None:
             "lower --segment."
         )
     if parts.is_recorded(config):
-        held = labels.pairs_in(Path(config.teacher), (config.queries.segment, spec.observation_size, spec.action_size))
+        sizes = config.queries.segment, spec.observation_size, spec.action_size
+        held = labels.pairs_in(Path(config.teacher), config.environment, sizes)
         if held < config.queries.budget:
             raise BadInput(
                 f"{config.teacher} holds {held} answered pairs, fewer than the budget of {config.queries.budget}; give "

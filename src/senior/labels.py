@@ -57,7 +57,7 @@ def export_labels(run: Path, out: Path) -> int:
         "steps": steps,
         "observation": o,
         "action": a,
-        "environment": config.env or config.task,
+        "environment": config.environment,
         "overlap": config.asking.overlap,
     }
     write(out, Labels(header, pairs, segments))
@@ -88,7 +88,9 @@ def _rows(db: sqlite3.Connection, query: str, names: Sequence[str]) -> list[dict
 # From files into a run.
 
 
-def import_labels(file: Path, preferences: Preferences, per_session: int, overlap: int = 1) -> int:
+def import_labels(
+    file: Path, preferences: Preferences, per_session: int, overlap: int = 1, environment: str | None = None
+) -> int:
     """Put labels into a preference file that holds no pair, as sessions of a run that has not asked anything yet.
 
     Taken are, in the order of asking, the pairs that all who were asked had answered, and ``overlap`` people or more:
@@ -96,10 +98,12 @@ def import_labels(file: Path, preferences: Preferences, per_session: int, overla
     reserve belongs to the session of the pair before it, and is not counted. Pairs and answers keep their numbers; what
     is the run's own is left open: when a pair is trained on, towards what, and what the model predicted.
 
-    Returns the number of pairs, reserves aside. Raises `BadInput` if the files are damaged or of other sizes than the
-    run, if they fill no session, or if a pair was asked already; then nothing is changed.
+    environment: of the run; None: it was compared already. Returns the number of pairs, reserves aside. Raises
+    `BadInput` if the files are damaged, of another environment or of other sizes than the run, if they fill no session,
+    or if a pair was asked already; then nothing is changed.
     """
     labels = read(file)
+    _check_environment(file, labels, environment)
     observation, action, _, _ = preferences.arrays
     budget, _, *sizes = observation.shape
     _check_shape(file, labels, (*sizes, action.shape[-1]))
@@ -131,13 +135,14 @@ def import_labels(file: Path, preferences: Preferences, per_session: int, overla
     return most
 
 
-def pairs_in(file: Path, shape: tuple[int, int, int] | None = None) -> int:
+def pairs_in(file: Path, environment: str | None = None, shape: tuple[int, int, int] | None = None) -> int:
     """How many pairs of a file a run with one person's answers can be asked: the largest budget that it serves.
 
-    shape: steps of a segment, sizes of an observation and of an action of that run. Raises `BadInput` if the files
-    are damaged or of another shape.
+    environment, shape: of that run; steps of a segment, sizes of an observation and of an action. Raises `BadInput` if
+    the files are damaged or of others.
     """
     labels = read(file)
+    _check_environment(file, labels, environment)
     if shape is not None:
         _check_shape(file, labels, shape)
     return sum(not labels.pairs[row]["reserve"] for row in labels.complete(overlap=1))
@@ -168,9 +173,15 @@ def import_into(run: Path, file: Path) -> int:
         directory.lock()
     try:
         with closing(Preferences(directory.preferences, config.queries.budget, *sizes)) as preferences:
-            return import_labels(file, preferences, config.queries.per_session, config.asking.overlap)
+            return import_labels(file, preferences, config.queries.per_session, config.asking.overlap, config.environment)
     finally:
         directory.close()
+
+
+def _check_environment(file: Path, labels: Labels, environment: str | None) -> None:
+    held = labels.header["environment"]
+    if environment not in (None, held):
+        raise BadInput(f"{file} holds labels of {held}, and the run is on {environment}.")
 
 
 def _check_shape(file: Path, labels: Labels, shape: tuple[int, ...]) -> None:

@@ -49,7 +49,7 @@ def train(arguments: list[str]) -> int:
     from senior import program
 
     config = options.config
-    name = (config.env or config.task).replace(":", "-").replace("/", "-")
+    name = config.environment.replace(":", "-").replace("/", "-")
     out = options.out or Path("runs") / f"{name}-{config.method.name}-{config.preset}"
     display = Display()
     try:

@@ -25,7 +25,7 @@ class Standing:
     @property
     def title(self) -> str:
         """Which run it is, in a few words."""
-        return f"{self.config.env or self.config.task}, {self.config.method.name}, seed {self.config.seed}"
+        return f"{self.config.environment}, {self.config.method.name}, seed {self.config.seed}"
 
     @property
     def goal(self) -> str:

@@ -16,6 +16,7 @@ import matplotlib
 import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
+from matplotlib.ticker import LogFormatter
 
 from senior.envs.metaworld import TASKS
 from senior.files import Damaged, unpack
@@ -257,11 +258,16 @@ def sizes(task: str, arms: Arms, look: Mapping[str, Look], left_out: list[LeftOu
         for label, own in found.items():
             paid, learned = _curve(own, "bonus", edges), _curve(own, "learned", edges)
             for curve, line, what in ((paid, "-", "bonus"), (learned, ":", "learned reward")):
-                seen = np.ma.masked_less(np.ma.masked_invalid(curve), LEAST)
-                axis.plot(middle / 1000, seen, color=look[label].colour, linestyle=line, label=f"{label}: {what}")
+                told = np.isfinite(curve)  # episodes may be longer than what lies between two points
+                seen = np.ma.masked_less(curve[told], LEAST)
+                how: dict[str, Any] = {"color": look[label].colour, "linestyle": line, "marker": ".", "markersize": 3}
+                axis.plot(middle[told] / 1000, seen, label=f"{label}: {what}", **how)
             for step, *values in zip(middle, paid, learned, strict=True):
-                rows.append((task, label, int(step), len(own), *map(float, values)))
+                if all(map(math.isfinite, values)):
+                    rows.append((task, label, int(step), len(own), *map(float, values)))
         axis.set(yscale="log", xlabel="thousand environment steps", ylabel="reward per step", title=task)
+        axis.yaxis.set_major_formatter(LogFormatter())  # the usual ones write formulas, which the style does not set
+        axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.4)))
         legend(figure, axis)
     caption = f"{task}: exploration bonus and size of the learned reward, mean over seeds."
     head = ("arm", "runs", "beta at first", "beta at last", "bonus", "learned reward", "bonus / learned reward")

@@ -129,4 +129,4 @@ def configured(arm: str, options: Mapping[str, str]) -> Config:
 
 def place(out: Path, config: Config, arm: str) -> Path:
     """The directory of a run of an arm."""
-    return out / slug(config.env or config.task) / slug(arm) / f"seed-{config.seed}"
+    return out / slug(config.environment) / slug(arm) / f"seed-{config.seed}"
