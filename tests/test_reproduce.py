@@ -212,6 +212,25 @@ def test_only_the_studys_own_runs_count_and_only_those_of_one_protocol(tmp_path:
     told = reproduce.write(studies, "quick", tmp_path)
     line = next(line for line in told.splitlines() if line.startswith("  mrn "))
     assert "3 seeds" in line and "reproduced" not in line
+    assert "Left out on demand: window-close, handle-press, window-open, door-open, door-unlock." in told
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert "arXiv 2506.14648" in page and "can be refuted here, and not confirmed" in page
+
+
+def test_runs_of_something_else_make_no_page_beside_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    write_run(tmp_path / "door-lock" / "own" / "seed-0", small("pebble"), protocol(), ("eval.csv",))
+    command = ["reproduce", "senior", "--scale", "smoke", "--no-train", "--out", str(tmp_path)]
+    assert main(command) == BAD_INPUT
+    assert f"{tmp_path} holds no finished run of the studies main at the scale smoke." in capsys.readouterr().err
+    assert not (tmp_path / "report").exists()
+
+
+def test_the_cells_of_a_study_can_be_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    command = ["reproduce", "senior", "--table", "quality", "--scale", "smoke", "--seeds", "3", "--list", "--out"]
+    assert main([*command, str(tmp_path / "new")]) == DONE
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3 * 2 * 6 and all(line.endswith("not begun") for line in lines)
+    assert not (tmp_path / "new").exists()
 
 
 # The command.
@@ -219,7 +238,11 @@ def test_only_the_studys_own_runs_count_and_only_those_of_one_protocol(tmp_path:
 
 def test_what_the_paper_has_not_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for options, said in (
-        ("senior --tasks door-close", "door-close"),
+        ("senior --tasks door-close", "has no door-close in main; its tasks there are door-lock, window-close, handle"),
+        (
+            "senior --table feedback quality --tasks door-open",
+            "in feedback or quality; its tasks there are door-lock, w",
+        ),
         ("senior --seeds 0", "--seeds must be at least 1"),
         ("pebble", "senior"),
         ("senior --table fig9", "ablation"),

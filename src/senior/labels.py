@@ -173,7 +173,9 @@ def import_into(run: Path, file: Path) -> int:
         directory.lock()
     try:
         with closing(Preferences(directory.preferences, config.queries.budget, *sizes)) as preferences:
-            return import_labels(file, preferences, config.queries.per_session, config.asking.overlap, config.environment)
+            return import_labels(
+                file, preferences, config.queries.per_session, config.asking.overlap, config.environment
+            )
     finally:
         directory.close()
 

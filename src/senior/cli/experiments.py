@@ -52,11 +52,15 @@ def sweep(arguments: Sequence[str]) -> int:
     axes = grid.merged(grid.read(options.file), given) if options.file else given
     cells = grid.cells_of(axes, options.out)
     if options.list:
-        check_cells(cells)
-        for cell in cells:
-            print(f"{cell}  {_stands(cell)}")
-        return DONE
+        return _list(cells)
     return run_cells(cells, options.out, options.jobs, options.ray)
+
+
+def _list(cells: Sequence[Cell]) -> int:
+    check_cells(cells)
+    for cell in cells:
+        print(f"{cell}  {_stands(cell)}")
+    return DONE
 
 
 def run_cells(cells: Sequence[Cell], out: Path, jobs: int | None, ray: str | None) -> int:
@@ -106,7 +110,7 @@ class ReproduceOptions:
     scale: Literal["paper", "quick", "smoke"] = "paper"
     """paper: the paper's numbers. quick: the preset quick, for a CPU, for 100,000 steps. smoke: toy sizes."""
     tasks: tuple[str, ...] = ()
-    """Only these of the paper's tasks. Left out: all."""
+    """Only these of the studies' tasks (docs/experiments.md). Left out: all."""
     seeds: int | None = None
     """How many seeds, from 0 on. Left out: 5, with --scale quick 8, with smoke 2."""
     out: Path | None = None
@@ -115,6 +119,8 @@ class ReproduceOptions:
     """As in senior sweep."""
     ray: str | None = None
     """As in senior sweep."""
+    list: bool = False
+    """Only list the cells and where they stand."""
     train: bool = True
     """--no-train: only make the page of what is finished."""
 
@@ -131,9 +137,11 @@ def reproduce(arguments: list[str]) -> int:
         raise BadInput(f"--seeds must be at least 1, not {seeds}.")
     studies = run.studies_of(options.table, options.tasks or None)
     out = options.out or Path("runs") / f"reproduce-{options.paper}-{options.scale}"
+    cells = run.cells(studies.values(), range(seeds), options.scale, out)
+    if options.list:
+        return _list(cells)
     code = DONE
     if options.train:
-        cells = run.cells(studies.values(), range(seeds), options.scale, out)
         code = run_cells(cells, out, options.jobs, options.ray)
     if code != INTERRUPTED:
         print(run.write(studies, options.scale, out))

@@ -84,8 +84,8 @@ def summary(tasks: Tasks, shared: Sequence[str] = ()) -> Section:
     short = sorted({run.steps for run in runs if run.steps < PAPER[1]})
     if short:
         text.append(
-            "The paper tells success at 500K and 1M steps. Runs that are shorter are told at half of their steps and "
-            f"at their end: they have {listed([f'{steps:,}' for steps in short])} steps."
+            "The SENIOR paper tells success at 500K and 1M steps. Runs that are shorter are told at half of their steps "
+            f"and at their end: they have {listed([f'{steps:,}' for steps in short])} steps."
         )
     silent = [task for task, arms in tasks.items() if not tells_success(arms)]
     if silent:

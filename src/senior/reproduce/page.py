@@ -13,6 +13,10 @@ from senior.reproduce.studies import AVERAGES, CLAIMS, MAIN, TASKS, Quantity, Sc
 from senior.reproduce.studies import Table as Which
 from senior.reproduce.verdicts import Judged, Runs, Verdict, judge_claim, judge_number
 
+WHAT = (
+    "The paper: SENIOR, efficient query selection and preference-guided exploration in preference-based reinforcement "
+    "learning (Ni et al. 2025, arXiv 2506.14648). Its numbers are of its main table, its sentences of Section V."
+)
 RULE = (
     "Rule, fixed before the runs: a number is reproduced if the 90 % interval of our mean lies within 10 points of the "
     "paper's, not reproduced if it lies wholly outside of that, undecided otherwise; in brackets then how many seeds "
@@ -20,7 +24,12 @@ RULE = (
 )
 CLAIM_RULE = (
     "Each sentence is a set of comparisons, each the 90 % interval of a difference: confirmed if all lie above their "
-    "margins, refuted if one lies wholly below, undecided otherwise. They are not corrected for their number."
+    "margins, refuted if one lies wholly below, missing if there are runs for none, undecided otherwise. They are not "
+    "corrected for their number."
+)
+SENTENCES = (
+    "The paper's sentences, in our words, and how many of their comparisons hold, fail, are open, and are missing for "
+    "want of runs."
 )
 SCALES: dict[Scale, str] = {
     "paper": "The paper's numbers of steps, labels and units. It ran five seeds, and reports the best of three rates "
@@ -56,13 +65,13 @@ def judge(tables: Sequence[Which], studies: dict[Which, Study], runs: Runs) -> J
     return Judgement(numbers, [judge_claim(claim, runs) for claim in CLAIMS if claim.table in tables])
 
 
-def sections(judged: Judgement, scale: Scale, refused: Sequence[str]) -> list[Section]:
-    """What the report begins with. ``refused``: sentences on runs that do not count."""
-    first = [_numbers(judged, scale, refused)] if judged.numbers else []
-    return [*first, _claims(judged.claims, scale, refused)]
+def sections(judged: Judgement, scale: Scale, notes: Sequence[str]) -> list[Section]:
+    """What the report begins with. ``notes``: sentences on tasks and runs that do not count."""
+    first = [_numbers(judged, scale, notes)] if judged.numbers else []
+    return [*first, _claims(judged.claims, scale, notes)]
 
 
-def _numbers(judged: Judgement, scale: Scale, refused: Sequence[str]) -> Section:
+def _numbers(judged: Judgement, scale: Scale, notes: Sequence[str]) -> Section:
     columns = list(dict.fromkeys(task for _, task, _ in judged.numbers))
     decides = scale == "paper"
     tables = [
@@ -82,7 +91,7 @@ def _numbers(judged: Judgement, scale: Scale, refused: Sequence[str]) -> Section
     ]
     head += ["verdict", "seeds that would decide"] if decides else []
     tables.append(Table("The same, a row per number.", head, rows, name="beside-the-paper", folded=True))
-    text = (SCALES[scale], *((RULE, _counted(judged.numbers.values(), "numbers")) if decides else ()), *refused)
+    text = (WHAT, SCALES[scale], *((RULE, _counted(judged.numbers.values(), "numbers")) if decides else ()), *notes)
     return Section("Beside the paper's main table", text, tuple(tables))
 
 
@@ -103,16 +112,16 @@ def _interval(interval: Interval) -> str:
     return "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * bound for bound in interval))
 
 
-def _claims(claims: Sequence[Judged], scale: Scale, refused: Sequence[str]) -> Section:
+def _claims(claims: Sequence[Judged], scale: Scale, notes: Sequence[str]) -> Section:
     rows = [
         [one.claim.sentence, one.claim.where, one.verdict, one.holding, one.failing, one.open, one.missing]
         for one in claims
     ]
     return Section(
         "Beside the paper's sentences",
-        (SCALES[scale], CLAIM_RULE, _counted(claims, "sentences"), *refused),
+        (WHAT, SCALES[scale], CLAIM_RULE, _counted(claims, "sentences"), *notes),
         (
-            Table("", ["sentence", "where", "verdict", "hold", "fail", "open", "missing"], rows, name="claims"),
+            Table(SENTENCES, ["sentence", "where", "verdict", "hold", "fail", "open", "missing"], rows, name="claims"),
             Table(
                 "Every comparison: how much higher the first is, with its interval, and by how much it should be.",
                 ["table", "higher", "lower", "difference", "low", "high", "margin"],

@@ -12,7 +12,7 @@ from senior.report.names import normal
 from senior.report.records import LeftOut, Run
 from senior.report.results import grouped
 from senior.reproduce import page
-from senior.reproduce.studies import Arm, Scale, Study, Table, chosen, configuration
+from senior.reproduce.studies import STUDIES, Arm, Scale, Study, Table, chosen, configuration
 from senior.sweep.cells import Cell
 from senior.sweep.grid import place
 from senior.types import BadInput
@@ -20,10 +20,11 @@ from senior.types import BadInput
 
 def studies_of(tables: Sequence[Table], tasks: tuple[str, ...] | None) -> dict[Table, Study]:
     """The studies, on those of ``tasks`` that each has; `BadInput` for a task that none has."""
-    found: dict[Table, Study] = {table: chosen(table, tasks) for table in tables}
+    known = dict.fromkeys(task for table in tables for task in STUDIES[table].tasks)
     for task in tasks or ():
-        if not any(task in study.tasks for study in found.values()):
-            raise BadInput(f"None of the studies {', '.join(tables)} is on {task}.")
+        if task not in known:
+            raise BadInput(f"The paper has no {task} in {' or '.join(tables)}; its tasks there are {', '.join(known)}.")
+    found: dict[Table, Study] = {table: chosen(table, tasks) for table in tables}
     return {table: study for table, study in found.items() if study.tasks}
 
 
@@ -84,9 +85,26 @@ def _comparable(config: Config) -> Config:
 
 
 def write(studies: dict[Table, Study], scale: Scale, out: Path) -> str:
-    """The page of what is finished below ``out``, in ``out/report``; returns its verdicts in lines for a terminal."""
+    """The page of what is finished below ``out``, in ``out/report``; returns its verdicts in lines for a terminal.
+
+    `BadInput` if no run of the studies is there.
+    """
     results = found([out])
     runs, refused = runs_by_arm(studies.values(), scale, out, results.runs)
+    if not runs and not refused:
+        raise BadInput(f"{out} holds no finished run of the studies {', '.join(studies)} at the scale {scale}.")
     judged = page.judge(list(studies), studies, runs)
-    built = page_of(results, out / "report", page.sections(judged, scale, refused))
-    return "\n".join([page.summary(judged, scale), *refused, str(built.page)])
+    notes = [*_restriction(studies), *refused]
+    built = page_of(results, out / "report", page.sections(judged, scale, notes))
+    return "\n".join([page.summary(judged, scale), *notes, str(built.page)])
+
+
+def _restriction(studies: dict[Table, Study]) -> list[str]:
+    """A sentence on the tasks of the studies that are left out, if some are."""
+    left = dict.fromkeys(task for table in studies for task in STUDIES[table].tasks if task not in studies[table].tasks)
+    if not left:
+        return []
+    return [
+        f"Left out on demand: {', '.join(left)}. What the paper's sentences say of them counts as missing: such a "
+        "sentence can be refuted here, and not confirmed."
+    ]
