@@ -232,8 +232,8 @@ def test_a_place_that_is_taken_or_cannot_be_written(capsys: pytest.CaptureFixtur
     Path("file").write_text("no directory")
     train = "train --task point --out"
     assert "taken/seed-1 exists and is not empty" in refused(f"{train} taken --seeds 2", capsys)
-    assert "file/seed-0 cannot be read and written: Not a directory" in refused(f"{train} file", capsys)
-    assert "file/below/seed-0 cannot be read and written" in refused(f"{train} file/below", capsys)
+    assert "file/seed-0 is, or lies in, a file where a directory should be." in refused(f"{train} file", capsys)
+    assert "file/below/seed-0 is, or lies in, a file" in refused(f"{train} file/below", capsys)
 
 
 def test_a_place_that_may_not_be_looked_into(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
@@ -244,7 +244,7 @@ def test_a_place_that_may_not_be_looked_into(capsys: pytest.CaptureFixture[str],
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "iterdir", refuse)
-    sentence = "hidden/seed-0 cannot be read and written: Permission denied"
+    sentence = "hidden/seed-0 cannot be opened: Permission denied"
     assert sentence in refused("train --task point --out hidden", capsys)
 
 
@@ -254,8 +254,8 @@ def test_a_video_or_figures_in_a_place_that_cannot_be(capsys: pytest.CaptureFixt
     Path("file").write_text("no directory")
     about = {"config": to_json(preset("quick", "point", "m-senior")), "protocol": {}}
     Path("run/config.json").write_text(json.dumps(about))
-    assert "file cannot be read and written: File exists" in refused("eval run --video file/a.mp4", capsys)
-    assert "file cannot be read and written: File exists" in refused("bench --json file/a.json", capsys)
+    assert "file is, or lies in, a file where a directory should be." in refused("eval run --video file/a.mp4", capsys)
+    assert "file is, or lies in, a file where a directory should be." in refused("bench --json file/a.json", capsys)
 
 
 DAMAGED = {

@@ -511,7 +511,7 @@ def test_a_broken_line_is_named(file: Path):
 
 
 def test_a_file_that_is_not_there_is_told(tmp_path: Path):
-    with pytest.raises(BadInput, match=r"labels\.jsonl cannot be read and written: No such file"):
+    with pytest.raises(BadInput, match=r"labels\.jsonl cannot be opened: No such file"):
         read(tmp_path / "labels.jsonl")
 
 

@@ -125,9 +125,10 @@ def test_opengl_that_does_not_start_is_one_sentence(tmp_path: Path, monkeypatch)
     assert why.endswith(drawing.INSTALL)
 
 
-def test_an_environment_that_draws_nothing(tmp_path: Path, monkeypatch):
+@pytest.mark.parametrize("render", ["return None", "raise NotImplementedError"])
+def test_an_environment_that_draws_nothing(render: str, tmp_path: Path, monkeypatch):
     (tmp_path / "blind.py").write_text(
-        "from senior.envs.point import Point\nclass Blind(Point):\n    def render(self): return None\n"
+        f"from senior.envs.point import Point\nclass Blind(Point):\n    def render(self): {render}\n"
     )
     monkeypatch.chdir(tmp_path)
     request = Request(None, 0, np.zeros((3, 2), np.float32), env="blind:Blind", position="0:2", horizon=5)

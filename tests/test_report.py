@@ -25,6 +25,7 @@ from senior.options import parse
 from senior.presets import preset, release, with_budget
 from senior.report import across, sections
 from senior.report.bands import MOST, Band, Frame, banded
+from senior.report.bands import grid as grid_of_panels
 from senior.report.build import Built, report
 from senior.report.looks import COLOURS, in_order, looks
 from senior.report.names import label, normal, options
@@ -402,6 +403,23 @@ def test_a_few_bands_share_an_axis_and_more_have_a_panel_each(bands: int):
         for label, axis in zip(labels, axes, strict=True):
             assert axis.get_title() == label
             assert [line.get_color() for line in axis.lines].count(looks(labels)[label].colour) == 1
+
+
+def test_panels_are_spread_evenly():
+    for panels, lines in ((5, [3, 2]), (7, [4, 3]), (9, [3, 3, 3]), (2, [2])):
+        _, axes = grid_of_panels({str(i): str(i) for i in range(panels)}, Frame("door-lock", "steps", "rate", 100.0))
+        rows = [axis.get_position().y0 for axis in axes.values()]
+        assert [rows.count(row) for row in sorted(set(rows), reverse=True)] == lines
+
+
+def test_a_page_of_something_else_is_not_overwritten(tmp_path: Path):
+    page = write([Section("Runs", ("m-senior --select uniform & others",))], tmp_path, "first")
+    assert '<span class="option">--select</span> uniform &amp; others' in page.read_text()
+    assert "<h1>second</h1>" in write([], tmp_path, "second").read_text()
+    page.write_text("<h1>my own</h1>")
+    with pytest.raises(BadInput, match=r"index\.html is no page of a report, and would be overwritten"):
+        write([], tmp_path, "third")
+    assert page.read_text() == "<h1>my own</h1>"
 
 
 GRID = {

@@ -130,7 +130,7 @@ class RunDirectory:
         differing = differences(replace(held, device=config.device), config)
         if differing:
             name, there, here = differing[0]
-            others = f" and {len(differing) - 1} more differences" if len(differing) > 1 else ""
+            others = f"; {', '.join(other for other, *_ in differing[1:])} differ too" if differing[1:] else ""
             raise BadInput(f"{self.path} holds another run: its {name} is {there}, not {here}{others}.")
 
     def append(self, table: str, row: Mapping[str, Any]) -> None:
@@ -230,8 +230,10 @@ def told(path: Path) -> Iterator[None]:
     """Whatever the file system refuses there becomes a sentence."""
     try:
         yield
+    except (FileExistsError, NotADirectoryError) as error:
+        raise BadInput(f"{path} is, or lies in, a file where a directory should be.") from error
     except OSError as error:
-        raise BadInput(f"{path} cannot be read and written: {error.strerror or error}.") from error
+        raise BadInput(f"{path} cannot be opened: {error.strerror or error}.") from error
 
 
 def make_room(file: Path) -> None:

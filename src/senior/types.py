@@ -22,7 +22,7 @@ class BadInput(Exception):
     def unknown(cls, kind: str, name: str, known: Iterable[str]) -> BadInput:
         """That ``name`` is no ``kind`` we know, with the nearest name that is."""
         names = list(known)
-        near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
+        near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
         hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(names)}."
         return cls(f"Unknown {kind} {name!r}; {hint}")
 

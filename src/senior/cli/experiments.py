@@ -168,7 +168,7 @@ def report(arguments: list[str]) -> int:
     built = report(options.runs, options.out)
     for line in grouped(built.left_out):
         print(f"left out: {line}", file=sys.stderr)
-    print(f"{built.runs} runs: {built.page}")
+    print(f"{built.runs} run{'' if built.runs == 1 else 's'}: {built.page}")
     return DONE
 
 
@@ -177,9 +177,9 @@ class WatchOptions:
     """Serve the page of senior report, live, while runs are trained."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Run directories, or directories that hold some, or will."""
+    """Run directories, or directories that hold some, or are there already and will."""
     host: str = "127.0.0.1"
-    """Address to listen on."""
+    """Address to listen on. 0.0.0.0 lets other machines in, all of them: there is no token."""
     port: int = 0
     """0: a free one."""
 

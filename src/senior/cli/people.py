@@ -19,7 +19,7 @@ from senior.types import BadInput
 
 @dataclass(frozen=True)
 class LabelOptions:
-    """Serve the labelling page of a run whose teacher are people, without training it."""
+    """Serve the labelling page of a run that people teach, without training it."""
 
     run: tyro.conf.Positional[Path]
     """A run directory."""
@@ -40,9 +40,9 @@ class ExportOptions:
 class ImportOptions:
     """Put exported labels into a run of people's that has not asked anything yet."""
 
-    run: tyro.conf.Positional[Path]
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """A run directory."""
-    file: tyro.conf.Positional[Path]
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """NAME.jsonl, with NAME.npz beside it."""
 
 

@@ -166,7 +166,10 @@ class _OwnCamera:
         self.env = env
 
     def frame(self) -> np.ndarray:
-        frame: Any = self.env.render()
+        try:
+            frame: Any = self.env.render()
+        except NotImplementedError:
+            frame = None
         if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.shape[2:] != (3,):
             raise NoVideo("the environment draws no rgb_array frames.")
         return frame

@@ -19,7 +19,7 @@ from senior.report.plane import evenly
 MOST = 4
 """Bands in one axis; where there are more, nobody can tell them apart."""
 ACROSS = 4
-"""Panels in a line."""
+"""Panels in a line, at most."""
 FEW = 40
 """Points of a grey curve."""
 GREY = "#8a8f96"
@@ -105,8 +105,8 @@ def banded(
 
 def grid(titles: Mapping[str, str], frame: Frame) -> tuple[Figure, dict[str, Axes]]:
     """A panel for each label, under its title."""
-    across = min(ACROSS, len(titles))
-    down = -(-len(titles) // across)
+    down = -(-len(titles) // ACROSS)
+    across = -(-len(titles) // down)
     figure = Figure(figsize=(max(WIDTH, 2.2 * across + 0.4), 1.75 * down + 0.9), layout="constrained")
     axes = list(figure.subplots(down, across, sharex=True, sharey=True, squeeze=False).flat)
     for axis in axes[len(titles) :]:

@@ -20,12 +20,15 @@ import matplotlib
 
 matplotlib.use("Agg")
 
+from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
 from senior.files import slug, write_atomically
 from senior.report.tables import Cell, latex, numbers, shown, to_csv
 from senior.types import BadInput
 
+MARK = b'name="generator" content="senior report"'
+"""In the head of every page."""
 LARGEST_SVG = 400_000
 """Bytes of a drawing above which the page shows its PNG instead."""
 DOTS = 150
@@ -78,10 +81,12 @@ def write(sections: Iterable[Section], out: Path, title: str) -> Path:
     sections are made one by one, memory for the largest of them is enough. Names are made safe for files and, where two
     are the same, told apart by a number.
 
-    Raises `BadInput` if ``out`` cannot be written.
+    Raises `BadInput` if ``out`` cannot be written, or holds a page of something else.
     """
-    template = _template()
+    template, page = _template(), out / "index.html"
     try:
+        if page.exists() and MARK not in page.read_bytes()[:1000]:
+            raise BadInput(f"{page} is no page of a report, and would be overwritten; choose another directory.")
         for folder in ("figures", "tables"):
             (out / folder).mkdir(parents=True, exist_ok=True)
         names, parts = _Names(), []
@@ -89,7 +94,6 @@ def write(sections: Iterable[Section], out: Path, title: str) -> Path:
             parts.append(_written(section, out, names))
             del section
             gc.collect()  # figures hold on to themselves
-        page = out / "index.html"
         write_atomically(page, template.render(title=title, sections=parts).encode())
     except OSError as error:
         raise BadInput(f"The report cannot be written into {out}: {error.strerror or error}.") from error
@@ -181,4 +185,10 @@ def _template() -> Any:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    environment.filters["options"] = _options
     return environment.get_template("page.html")
+
+
+def _options(text: str) -> Markup:
+    """A text whose ``--options`` are not broken at the ends of lines."""
+    return Markup(re.sub(r"(?<!\S)--[\w.-]+", r'<span class="option">\g<0></span>', str(escape(text))))

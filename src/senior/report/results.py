@@ -115,7 +115,7 @@ def _once(runs: list[Run], left_out: list[LeftOut]) -> list[Run]:
 
 
 def _unshared(runs: Sequence[Run]) -> tuple[list[Run], tuple[str, ...]]:
-    """Runs of several methods without the options that all of those that ask people have, and these options."""
+    """Runs of several methods without the options that all of those that ask have, and these options."""
     asking = [words(run.config) for run in runs if run.asks and run.config is not None]
     if len({run.method for run in runs if run.asks}) < 2 or not asking:
         return list(runs), ()

@@ -80,12 +80,12 @@ def summary(tasks: Tasks, shared: Sequence[str] = ()) -> Section:
         "all steps, or over all asked pairs."
     ]
     if shared:
-        text.append(f"All arms that ask people have, beside what their names tell: {' '.join(shared)}.")
+        text.append(f"All arms that ask for answers have, beside what their names tell: {' '.join(shared)}.")
     short = sorted({run.steps for run in runs if run.steps < PAPER[1]})
     if short:
         text.append(
-            "The SENIOR paper tells success at 500K and 1M steps. Runs that are shorter are told at half of their steps "
-            f"and at their end: they have {listed([f'{steps:,}' for steps in short])} steps."
+            "The SENIOR paper tells success at 500K and 1M steps. Shorter runs are told at half of their steps and at "
+            f"their end: they have {listed([f'{steps:,}' for steps in short])} steps."
         )
     silent = [task for task, arms in tasks.items() if not tells_success(arms)]
     if silent:
@@ -192,8 +192,8 @@ def reward_model(tasks: Tasks, looks: Mapping[str, Look]) -> Section | None:
                 rows.append([task, label, len(told), *cells])
     if not rows:
         return None
-    head = ("task", "arm", "runs", f"right of the last {across.PAIRS} pairs", "correlation", "rank correlation")
-    head += ("successful episodes while asking",)
+    head = ("task", "arm", "runs", f"right of the last pairs, {across.PAIRS} at most")
+    head += ("correlation", "rank correlation", "successful episodes while asking")
     caption = "Prospective accuracy at the end of asking, and how learned and true return of an episode go together."
     text = (
         "Prospective accuracy is of pairs that the reward model has not seen: it judges a session's pairs before it is "
@@ -247,7 +247,7 @@ def cost(tasks: Tasks) -> Section:
     if total:
         text.append(
             f"{shown(total / 3600)} hours of wall time in all. Hours are counted run by run, evaluations included; "
-            "runs that shared a program or a machine each count the whole time, so the machine was busy for less."
+            "runs that shared a program or a machine each count the whole time, so machines may have been busy less."
         )
     if untold:
         text.append(f"{untold} runs do not tell their time.")
@@ -267,5 +267,5 @@ def every_run(tasks: Tasks) -> Table:
                 cells += [_area_by_steps(run), _area_by_labels(run)]
                 cells += [int(told.labels[-1]), run.seconds, run.step, run.steps, str(run.path)]
                 rows.append(cells)
-    head = ("task", "arm", "seed", "at 500K or half", "at 1000K or the end", "area by steps", "area by labels")
+    head = ("task", "arm", "seed", "at 500K or half", "at 1M or the end", "area by steps", "area by labels")
     return Table("Every run.", (*head, "labels", "seconds", "step", "of", "path"), rows, "every-run", folded=True)

@@ -283,7 +283,7 @@ def serve(places: Sequence[Path], host: str = "127.0.0.1", port: int = 0, least:
     """
     for place in places:
         if not place.is_dir():
-            raise BadInput(f"There is no directory {place}.")
+            raise BadInput(f"{place} is no directory." if place.exists() else f"There is no directory {place}.")
     listening = _bind(host, port)
     shown = f"[{host}]" if ":" in host else host
     builder = Builder(places, least)
@@ -303,6 +303,8 @@ def serve(places: Sequence[Path], host: str = "127.0.0.1", port: int = 0, least:
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         print(f"http://{shown}:{listening.getsockname()[1]}/", flush=True)
+        if not is_loopback(host):
+            print(f"It asks for no token: whoever reaches {socket.gethostname()} can read it.", flush=True)
         server.run(sockets=[listening])
     finally:
         builder.close()

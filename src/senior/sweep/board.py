@@ -67,9 +67,10 @@ class Board:
         if taken > before and now > then:
             rate = (taken - before) / (now - then)
             left = f", {rate:,.0f} steps/s, {timedelta(seconds=round((steps - taken) / rate))} left"
-        counts = f"{len(sweep.finished)} of {len(sweep.cells)} cells done, {len(sweep.running)} running"
+        done = f"{len(sweep.finished)} of {len(sweep.cells)} cells done"
+        others = f", {len(sweep.running)} running, {len(sweep.waiting)} waiting" if self._live else ""
         failed = f", {len(sweep.failed)} failed" if sweep.failed else ""
-        return f"{counts}, {len(sweep.waiting)} waiting{failed}{left}"
+        return f"{done}{others}{failed}{left}"
 
     def _table(self, sweep: Sweep, line: str) -> Table:
         """A row per directory of seeds, as many as the terminal has room for, those under way first."""

@@ -103,7 +103,7 @@ def cells_of(grid: Grid, out: Path) -> list[Cell]:
     for arm in axes["arm"]:
         own = {word[2:].partition("=")[0].replace("_", "-") for word in arm.split() if word.startswith("--")}
         for name in sorted(own & {*axes, "task", "seed"}):
-            raise BadInput(f"The arm {arm!r} has a --{name} of its own, and so has the sweep.")
+            raise BadInput(f"The arm {arm!r} has a --{name} of its own; give it to the sweep, for all arms.")
     axes = {"seed": axes.pop("seed", ["0"]), **axes}  # the first seed of every arm comes before the second of any
     varied = [name for name, values in axes.items() if len(values) > 1 and name not in ("arm", "task", "seed", "env")]
     cells = []
