@@ -356,11 +356,13 @@ def test_interrupted_it_leaves_everything_resumable(undisturbed: Path, tmp_path:
     run = tmp_path / "point" / "m-senior" / "seed-0"
     with begin(tmp_path, "--jobs", str(min(2, threads()))) as sweep:
         worker = worker_of(run, 450)
+        os.kill(worker, signal.SIGSTOP)  # else it may be done before the second has come so far
         second = subprocess.run(
             [sys.executable, "-m", "senior.cli", *SWEEP, "--out", tmp_path], capture_output=True, text=True, timeout=60
         )
         assert second.returncode == BAD_INPUT and "Another sweep is at work" in second.stderr
         sweep.send_signal(signal.SIGINT)
+        os.kill(worker, signal.SIGCONT)
         out, err = sweep.communicate(timeout=300)
     assert sweep.returncode == INTERRUPTED, err
     assert "Interrupted, all saved; the same command goes on." in out
