@@ -368,12 +368,35 @@ def test_episodes_with_success_are_counted_until_the_last_session(tmp_path: Path
     assert section is not None
     assert section.tables[0].head[-1] == "successful episodes while asking"
     assert section.tables[0].rows[0][-1] == "2.00"
+    (every_run,) = [
+        table for table in sections.summary(sections.by_task(read([tmp_path]).runs)).tables if table.name == "every-run"
+    ]
+    assert every_run.rows[0][list(every_run.head).index("successful episodes while asking")] == 2
     (path / "train.csv").write_text("\n".join([head, *(line[:-1] for line in told)]) + "\n")
     section = sections.reward_model(sections.by_task(read([tmp_path]).runs), looks(["pebble"]))
     assert section is not None
     assert section.tables[0].rows[0][-1] is None  # not told is not none
     (path / "train.csv").write_text(head + "\n")
     assert sections.reward_model(sections.by_task(read([tmp_path]).runs), looks(["pebble"])) is None
+
+
+def test_what_was_found_while_asking_is_set_beside_what_was_reached(tmp_path: Path):
+    head = "step,episode_return,learned_return,queried,labels,reward_accuracy,episode_success"
+
+    def said(runs: int) -> tuple[str, ...]:
+        for seed in range(runs):
+            path = tmp_path / str(runs) / f"seed-{seed}"
+            evaluated(path, config(seed=seed), [0, 0, 0, (runs - seed) / 100])
+            told = [f"{10_500 + i},1,1,{5 if i < 12 else 9},5,1,{int(i < seed)}" for i in range(20)]
+            (path / "train.csv").write_text("\n".join([head, *told]) + "\n")
+        section = sections.reward_model(sections.by_task(read([tmp_path / str(runs)]).runs), looks(["pebble"]))
+        assert section is not None
+        return section.text[1:]
+
+    assert said(9) == ()
+    assert [line.split(", ", 1)[1] for line in said(10)] == [
+        "the number of those episodes and the area by steps have a rank correlation of -1.00."
+    ]
 
 
 def test_runs_evaluated_at_other_steps_are_read_off_lines():

@@ -171,8 +171,9 @@ def accuracy_curves(task: str, arms: Runs, looks: Mapping[str, Look]) -> Drawing
         return None
     frame = Frame(task, STEPS, "prospective accuracy", 1.02 * max(steps[-1] for steps, _ in curves.values()), level=0.5)
     caption = (
-        f"{task}: share of the latest asked pairs, {PAIRS} at most, that the reward model judged rightly before it was "
-        "fitted to them; mean and standard deviation over seeds. Dotted: chance."
+        f"{task}: share of pairs that the reward model judged rightly before it was fitted to them, over the latest "
+        f"sessions that have {PAIRS} together, or all there are; mean and standard deviation over seeds. Dotted: "
+        "chance."
     )
     return Drawing(
         f"{task}-accuracy", caption, banded(_deviations(curves), looks, frame), _mean_rows("step", task, curves)

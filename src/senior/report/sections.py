@@ -43,6 +43,9 @@ from senior.report.tables import Cell, shown
 
 PAPER = (500_000, 1_000_000)
 """The steps at which the paper's table tells success."""
+FOUND = "successful episodes while asking"
+CORRELATED = 10
+"""Runs of a task, at least, over which a correlation is told."""
 LONG = 24
 """Lines of a table above which it is shown when it is asked for."""
 
@@ -192,9 +195,11 @@ def reward_model(tasks: Tasks, looks: Mapping[str, Look]) -> Section | None:
                 rows.append([task, label, len(told), *cells])
     if not rows:
         return None
-    head = ("task", "arm", "runs", f"right of the last pairs, {across.PAIRS} at most")
-    head += ("correlation", "rank correlation", "successful episodes while asking")
-    caption = "Prospective accuracy at the end of asking, and how learned and true return of an episode go together."
+    head = ("task", "arm", "runs", "right of the last pairs", "correlation", "rank correlation", FOUND)
+    caption = (
+        f"Prospective accuracy over the latest sessions that have {across.PAIRS} pairs together, or all there are, and "
+        "how learned and true return of an episode go together."
+    )
     text = (
         "Prospective accuracy is of pairs that the reward model has not seen: it judges a session's pairs before it is "
         "fitted to them. Correlations are over the episodes of the main phase, each with the return that the model of "
@@ -203,8 +208,9 @@ def reward_model(tasks: Tasks, looks: Mapping[str, Look]) -> Section | None:
         "asked about what was never reached: the last column counts the training episodes with success before the last "
         "session."
     )
+    said = [sentence for task, arms in tasks.items() if (sentence := _discovery(task, arms))]
     return Section(
-        "Reward model", (text,), (Table(caption, head, rows, "reward-model", len(rows) > LONG),), tuple(figures)
+        "Reward model", (text, *said), (Table(caption, head, rows, "reward-model", len(rows) > LONG),), tuple(figures)
     )
 
 
@@ -217,6 +223,22 @@ def _found(run: Run) -> int | None:
         return None
     asking = told.queried < np.nanmax(told.queried)
     return int((known & asking & (told.episode_success > 0)).sum())
+
+
+def _discovery(task: str, arms: Mapping[str, Sequence[Run]]) -> str | None:
+    """How that number goes with what is reached, over all runs of a task; None of few runs."""
+    told = [
+        (found, _area_by_steps(run))
+        for run in finished([run for runs in arms.values() for run in runs])
+        if run.asks and run.episodes is not None and (found := _found(run)) is not None
+    ]
+    if len(told) < CORRELATED:
+        return None
+    together = rank_correlation(*np.array(told).T)
+    return (
+        f"{task}: over {len(told)} runs of all arms, the number of those episodes and the area by steps have a rank "
+        f"correlation of {together:.2f}."
+    )
 
 
 def _agreement(run: Run, measure: Callable[[np.ndarray, np.ndarray], float]) -> float:
@@ -265,7 +287,8 @@ def every_run(tasks: Tasks) -> Table:
                 told = run.evaluation
                 cells: list[Cell] = [task, label, run.seed, *(run.score_at(step) for step in _marks([run]))]
                 cells += [_area_by_steps(run), _area_by_labels(run)]
+                cells.append(_found(run) if run.asks and run.episodes is not None else None)
                 cells += [int(told.labels[-1]), run.seconds, run.step, run.steps, str(run.path)]
                 rows.append(cells)
-    head = ("task", "arm", "seed", "at 500K or half", "at 1M or the end", "area by steps", "area by labels")
+    head = ("task", "arm", "seed", "at 500K or half", "at 1M or the end", "area by steps", "area by labels", FOUND)
     return Table("Every run.", (*head, "labels", "seconds", "step", "of", "path"), rows, "every-run", folded=True)
