@@ -226,15 +226,15 @@ def _found(run: Run) -> int | None:
 
 
 def _discovery(task: str, arms: Mapping[str, Sequence[Run]]) -> str | None:
-    """How that number goes with what is reached, over all runs of a task; None of few runs."""
+    """How that number goes with what is reached, over all runs of a task; None of few runs, or of equal ones."""
     told = [
         (found, _area_by_steps(run))
         for run in finished([run for runs in arms.values() for run in runs])
         if run.asks and run.episodes is not None and (found := _found(run)) is not None
     ]
-    if len(told) < CORRELATED:
+    together = rank_correlation(*np.array(told).T) if len(told) >= CORRELATED else math.nan
+    if math.isnan(together):
         return None
-    together = rank_correlation(*np.array(told).T)
     return (
         f"{task}: over {len(told)} runs of all arms, the number of those episodes and the area by steps have a rank "
         f"correlation of {together:.2f}."
