@@ -20,7 +20,6 @@ import matplotlib
 
 matplotlib.use("Agg")
 
-from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
 from senior.files import slug, write_atomically
@@ -185,10 +184,4 @@ def _template() -> Any:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters["options"] = _options
     return environment.get_template("page.html")
-
-
-def _options(text: str) -> Markup:
-    """A text whose ``--options`` are not broken at the ends of lines."""
-    return Markup(re.sub(r"(?<!\S)--[\w.-]+", r'<span class="option">\g<0></span>', str(escape(text))))
