@@ -103,10 +103,9 @@ def import_labels(
     or if a pair was asked already; then nothing is changed.
     """
     labels = read(file)
-    _check_environment(file, labels, environment)
     observation, action, _, _ = preferences.arrays
     budget, _, *sizes = observation.shape
-    _check_shape(file, labels, (*sizes, action.shape[-1]))
+    _check_fit(file, labels, environment, (*sizes, action.shape[-1]))
     taken: list[int] = []
     sessions: list[int] = []
     complete = labels.complete(overlap)
@@ -142,9 +141,7 @@ def pairs_in(file: Path, environment: str | None = None, shape: tuple[int, int, 
     the files are damaged or of others.
     """
     labels = read(file)
-    _check_environment(file, labels, environment)
-    if shape is not None:
-        _check_shape(file, labels, shape)
+    _check_fit(file, labels, environment, shape)
     return sum(not labels.pairs[row]["reserve"] for row in labels.complete(overlap=1))
 
 
@@ -180,14 +177,12 @@ def import_into(run: Path, file: Path) -> int:
         directory.close()
 
 
-def _check_environment(file: Path, labels: Labels, environment: str | None) -> None:
+def _check_fit(file: Path, labels: Labels, environment: str | None, shape: tuple[int, ...] | None) -> None:
+    """`BadInput` for labels of another environment or of other sizes; what is None is not compared."""
     held = labels.header["environment"]
     if environment not in (None, held):
         raise BadInput(f"{file} holds labels of {held}, and the run is on {environment}.")
-
-
-def _check_shape(file: Path, labels: Labels, shape: tuple[int, ...]) -> None:
-    if labels.shape != shape:
+    if shape not in (None, labels.shape):
         raise BadInput(
             f"{file} holds segments of {labels.shape[0]} steps, with {labels.shape[1]} numbers of an observation and "
             f"{labels.shape[2]} of an action; the run's have {shape[0]}, {shape[1]} and {shape[2]}."

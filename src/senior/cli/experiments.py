@@ -162,13 +162,13 @@ def report(arguments: list[str]) -> int:
     options = parse(ReportOptions, arguments, None, "report")
     if not options.runs:
         raise BadInput("Name at least one run, or a directory that holds some.")
-    from senior.report.build import report
+    from senior.report.build import counted, report
     from senior.report.results import grouped
 
     built = report(options.runs, options.out)
     for line in grouped(built.left_out):
         print(f"left out: {line}", file=sys.stderr)
-    print(f"{built.runs} run{'' if built.runs == 1 else 's'}: {built.page}")
+    print(f"{counted(built.runs, 'run')}: {built.page}")
     return DONE
 
 

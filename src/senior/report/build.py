@@ -58,8 +58,8 @@ def page_of(results: Results, out: Path, first: Sequence[Section] = ()) -> Built
     """The page of runs that are read already. `BadInput` if ``out`` cannot be written."""
     tasks = sections.by_task(results.runs)
     colours = looks(label for arms in tasks.values() for label in arms)
-    title = f"{_counted(len(results.runs), 'run')} of {_counted(len(colours), 'arm')}"
-    title += f" on {next(iter(tasks)) if len(tasks) == 1 else _counted(len(tasks), 'task')}"
+    title = f"{counted(len(results.runs), 'run')} of {counted(len(colours), 'arm')}"
+    title += f" on {next(iter(tasks)) if len(tasks) == 1 else counted(len(tasks), 'task')}"
     page = write((part for part in chain(first, _parts(results, tasks, colours)) if part is not None), out, title)
     return Built(page, len(results.runs), list(results.left_out))
 
@@ -78,7 +78,8 @@ def _parts(results: Results, tasks: Tasks, colours: Mapping[str, Look]) -> Itera
     yield left_out(results.left_out)
 
 
-def _counted(number: int, word: str) -> str:
+def counted(number: int, word: str) -> str:
+    """So many of them, in words."""
     return f"{number} {word}" if number == 1 else f"{number} {word}s"
 
 

@@ -26,8 +26,8 @@ from senior.files import slug, write_atomically
 from senior.report.tables import Cell, latex, numbers, shown, to_csv
 from senior.types import BadInput
 
-MARK = b'name="generator" content="senior report"'
-"""In the head of every page."""
+GENERATOR = "senior report"
+"""What is told in the head of every page to have made it."""
 LARGEST_SVG = 400_000
 """Bytes of a drawing above which the page shows its PNG instead."""
 DOTS = 150
@@ -84,7 +84,7 @@ def write(sections: Iterable[Section], out: Path, title: str) -> Path:
     """
     template, page = _template(), out / "index.html"
     try:
-        if page.exists() and MARK not in page.read_bytes()[:1000]:
+        if page.exists() and f'content="{GENERATOR}"'.encode() not in page.read_bytes()[:1000]:
             raise BadInput(f"{page} is no page of a report, and would be overwritten; choose another directory.")
         for folder in ("figures", "tables"):
             (out / folder).mkdir(parents=True, exist_ok=True)
@@ -93,7 +93,7 @@ def write(sections: Iterable[Section], out: Path, title: str) -> Path:
             parts.append(_written(section, out, names))
             del section
             gc.collect()  # figures hold on to themselves
-        write_atomically(page, template.render(title=title, sections=parts).encode())
+        write_atomically(page, template.render(title=title, generator=GENERATOR, sections=parts).encode())
     except OSError as error:
         raise BadInput(f"The report cannot be written into {out}: {error.strerror or error}.") from error
     return page

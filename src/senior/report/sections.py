@@ -215,9 +215,10 @@ def reward_model(tasks: Tasks, looks: Mapping[str, Look]) -> Section | None:
 
 
 def _found(run: Run) -> int | None:
-    """Training episodes with success before the last session; None where it is not told."""
-    assert run.episodes is not None
+    """Training episodes with success before the last session; None where it is not told, or nobody is asked."""
     told = run.episodes
+    if told is None or not run.asks:
+        return None
     known = np.isfinite(told.queried) & np.isfinite(told.episode_success)
     if not known.any():
         return None
@@ -230,7 +231,7 @@ def _discovery(task: str, arms: Mapping[str, Sequence[Run]]) -> str | None:
     told = [
         (found, _area_by_steps(run))
         for run in finished([run for runs in arms.values() for run in runs])
-        if run.asks and run.episodes is not None and (found := _found(run)) is not None
+        if (found := _found(run)) is not None
     ]
     together = rank_correlation(*np.array(told).T) if len(told) >= CORRELATED else math.nan
     if math.isnan(together):
@@ -286,8 +287,7 @@ def every_run(tasks: Tasks) -> Table:
             for run in runs:
                 told = run.evaluation
                 cells: list[Cell] = [task, label, run.seed, *(run.score_at(step) for step in _marks([run]))]
-                cells += [_area_by_steps(run), _area_by_labels(run)]
-                cells.append(_found(run) if run.asks and run.episodes is not None else None)
+                cells += [_area_by_steps(run), _area_by_labels(run), _found(run)]
                 cells += [int(told.labels[-1]), run.seconds, run.step, run.steps, str(run.path)]
                 rows.append(cells)
     head = ("task", "arm", "seed", "at 500K or half", "at 1M or the end", "area by steps", "area by labels", FOUND)
