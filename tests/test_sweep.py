@@ -147,6 +147,22 @@ def test_what_makes_no_sense_is_refused_before_anything_runs(
     assert not list(tmp_path.rglob("config.json"))
 
 
+@pytest.mark.parametrize(
+    ("beside", "said"),
+    [
+        ("", "grid.toml: Unknown option --metod"),
+        ("--seed 3", "grid.toml, or the options beside it: Unknown option --metod"),
+    ],
+)
+def test_what_makes_no_sense_in_a_file_is_told_with_the_file(
+    beside: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "grid.toml").write_text('metod = "m-senior"')
+    arguments = ["sweep", "--out", str(tmp_path / "out"), "--file", str(tmp_path / "grid.toml"), *beside.split()]
+    assert main(arguments) == BAD_INPUT
+    assert said in capsys.readouterr().err
+
+
 # Cells to workers, with a crew that does what the test says.
 
 

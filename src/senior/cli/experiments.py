@@ -49,11 +49,20 @@ def sweep(arguments: Sequence[str]) -> int:
     if "-h" in arguments:
         mine = ["--help"]
     options = parse(SweepOptions, mine, None, "sweep")
-    axes = grid.merged(grid.read(options.file), given) if options.file else given
-    cells = grid.cells_of(axes, options.out)
+    cells = _cells(options.file, given, options.out)
     if options.list:
         return _list(cells)
     return run_cells(cells, options.out, options.jobs, options.ray)
+
+
+def _cells(file: Path | None, given: grid.Grid, out: Path) -> list[Cell]:
+    if file is None:
+        return grid.cells_of(given, out)
+    axes = grid.merged(grid.read(file), given)
+    try:
+        return grid.cells_of(axes, out)
+    except BadInput as error:
+        raise BadInput(f"{file}{', or the options beside it' if given else ''}: {error}") from error
 
 
 def _list(cells: Sequence[Cell]) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from senior.report.page import Section, Table
@@ -67,11 +68,11 @@ def judge(tables: Sequence[Which], studies: dict[Which, Study], runs: Runs) -> J
 
 def sections(judged: Judgement, scale: Scale, notes: Sequence[str]) -> list[Section]:
     """What the report begins with. ``notes``: sentences on tasks and runs that do not count."""
-    first = [_numbers(judged, scale, notes)] if judged.numbers else []
-    return [*first, _claims(judged.claims, scale, notes)]
+    first, *rest = [*([_numbers(judged, scale)] if judged.numbers else []), _claims(judged.claims)]
+    return [replace(first, text=(WHAT, SCALES[scale], *first.text, *notes)), *rest]
 
 
-def _numbers(judged: Judgement, scale: Scale, notes: Sequence[str]) -> Section:
+def _numbers(judged: Judgement, scale: Scale) -> Section:
     columns = list(dict.fromkeys(task for _, task, _ in judged.numbers))
     decides = scale == "paper"
     tables = [
@@ -91,7 +92,7 @@ def _numbers(judged: Judgement, scale: Scale, notes: Sequence[str]) -> Section:
     ]
     head += ["verdict", "seeds that would decide"] if decides else []
     tables.append(Table("The same, a row per number.", head, rows, name="beside-the-paper", folded=True))
-    text = (WHAT, SCALES[scale], *((RULE, _counted(judged.numbers.values(), "numbers")) if decides else ()), *notes)
+    text = (RULE, _counted(judged.numbers.values(), "numbers")) if decides else ()
     return Section("Beside the paper's main table", text, tuple(tables))
 
 
@@ -112,14 +113,14 @@ def _interval(interval: Interval) -> str:
     return "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * bound for bound in interval))
 
 
-def _claims(claims: Sequence[Judged], scale: Scale, notes: Sequence[str]) -> Section:
+def _claims(claims: Sequence[Judged]) -> Section:
     rows = [
         [one.claim.sentence, one.claim.where, one.verdict, one.holding, one.failing, one.open, one.missing]
         for one in claims
     ]
     return Section(
         "Beside the paper's sentences",
-        (WHAT, SCALES[scale], CLAIM_RULE, _counted(claims, "sentences"), *notes),
+        (CLAIM_RULE, _counted(claims, "sentences")),
         (
             Table(SENTENCES, ["sentence", "where", "verdict", "hold", "fail", "open", "missing"], rows, name="claims"),
             Table(
