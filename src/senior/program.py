@@ -67,9 +67,10 @@ def train_all(
 ) -> list[Result]:
     """Train runs of any configurations, each in its directory, on one device.
 
-    Runs whose configurations have one `senior.shape` share one program: they may differ in seed, task,
-    schedule, teacher and numbers. Programs of different shapes go side by side on a GPU, one after the other on a CPU.
-    A run's result does not depend on what the runs beside it do; under ``vmap`` its last bits do on how many they are.
+    Runs whose configurations have one `senior.shape` share one program: they may differ in seed, task, teacher,
+    learning rates, and in what is asked and when. Programs of different shapes go side by side on a GPU, one after
+    the other on a CPU. A run's result does not depend on what the runs beside it do; under ``vmap`` its last bits do
+    on how many they are.
 
     watcher: who is told of every step and of warnings, and can stop the runs, all saved; None prints warnings.
     lift: how runs share a program, ``loop`` or ``vmap``; None takes what suits the device.
