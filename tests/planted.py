@@ -80,12 +80,13 @@ class Asking:
         objects: np.ndarray | None = None,
         scores: Mapping[str, Sequence[float]] | None = None,
         reserves: int = 0,
+        episodes: np.ndarray | None = None,
     ) -> list[int]:
         """Ask a session of pairs whose end-effector goes along ``position [P, 2, H, 3]``.
 
         labels: the answers, by default that all second ones are better; None: nobody has answered. returns: true return
         of each segment ``[P, 2]``. objects: where the object is at the beginning of each ``[P, 2, 3]``; then it goes
-        far away.
+        far away. episodes: the numbers of those that the segments are of ``[P, 2]``, by default 0.
         """
         pairs = len(position)
         observation = np.zeros((pairs, 2, self.steps, self.observation), np.float32)
@@ -96,7 +97,8 @@ class Asking:
         reward = np.zeros((pairs, 2, self.steps), np.float32)
         reward[..., -1] = 0 if returns is None else returns
         action = np.zeros((pairs, 2, self.steps, ACTION), np.float32)
-        held = Pairs(observation, action, reward, np.zeros((pairs, 2), int), np.zeros((pairs, 2), int))
+        none = np.zeros((pairs, 2), int)
+        held = Pairs(observation, action, reward, none if episodes is None else episodes, none)
         query = Query(held, {name: np.asarray(value, float) for name, value in (scores or {}).items()})
         shown, step = np.zeros(pairs, int), 10_000 + 5000 * self.sessions
         ids = self.preferences.add(query, self.sessions, step, 0, shown, reserves)

@@ -57,10 +57,11 @@ def table_of(section: Section | None) -> dict[str, dict[str, object]]:
 
 
 def test_the_table_tells_what_the_pairs_after_the_first_session_are_like(tmp_path: Path):
-    with Asking(run_of(tmp_path, config_of("mrn")), H) as asking:
+    with Asking(run_of(tmp_path, config_of("mrn"), files=("eval.csv", "train.csv")), H) as asking:
         asking.ask(np.stack([pair(UP, UP)] * 4))  # drawn at random: it does not count
         both = np.stack([pair(RIGHT, LEFT), pair(RIGHT, RIGHT), pair(RIGHT, STAY), pair(LEFT, UP)])
-        asking.ask(both, [0, -1, None, 1], returns=np.array([[1, 9], [9, 1], [2, 2], [0, 4]]))
+        returns, episodes = np.array([[1, 9], [9, 1], [2, 2], [0, 4]]), np.array([[0, 19], [20, 5], [60, 40], [21, 22]])
+        asking.ask(both, [0, -1, None, 1], returns, episodes=episodes)
     with Asking(run_of(tmp_path, config_of("m-senior")), H) as asking:
         asking.ask(np.stack([pair(RIGHT, LEFT)]))
     told = table_of(pairs.section(runs_below(tmp_path)))
@@ -71,6 +72,7 @@ def test_the_table_tells_what_the_pairs_after_the_first_session_are_like(tmp_pat
         "path length (m)": pytest.approx((7 * 0.1 + 0.3 - 0.1) / 8),
         "angle (degrees)": pytest.approx((180 + 0 + 90) / 3, abs=1e-4),  # what stays has no direction
         "difference of returns": pytest.approx((8 + 8 + 0 + 4) / 4),
+        "of pre-training": 3 / 8,  # 20 episodes of 500 steps
         "equal": 0.25,
         "skipped": 0.25,
     }

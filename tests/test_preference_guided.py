@@ -192,6 +192,15 @@ def test_beta_begins_at_its_first_value_and_decays_with_its_clock(clock: str, ex
     np.testing.assert_allclose(betas, [0.2 * 0.99**t for t in exponents], rtol=1e-4)
 
 
+def test_refreshes_that_pay_nothing_for_want_of_preferences_do_not_spend_the_weight():
+    bonus = bonus_of(beta=0.2, decay=0.01)
+    state = bonus.on_refresh(bonus.init(), jax.random.key(0), replay_of(), now())
+    assert not bool(state.ready) and int(state.refreshes) == 0
+    state = bonus.on_session(state, jax.random.key(1), jnp.asarray(preferred_of()), jnp.int32(30))
+    state = bonus.on_refresh(state, jax.random.key(1), replay_of(), now())
+    assert float(bonus.report(state, EMPTY, now())["beta"]) == pytest.approx(0.2)
+
+
 # What is paid.
 
 

@@ -176,6 +176,14 @@ def test_the_last_session_is_cut_to_what_is_left():
     assert due(config, 15_000, 250).session == 0
 
 
+def test_no_session_begins_while_an_earlier_one_is_open_and_its_pairs_are_left():
+    config = preset("paper", "door-lock", "m-senior")
+    last = due(config, 20_000, 245)
+    assert (last.session, last.outer) == (5, False)
+    later = due(config, 20_000, 245, session_open=True)
+    assert (later.session, later.outer) == (0, True)
+
+
 def test_outer_steps_stop_with_the_budget_unless_told_otherwise():
     config = preset("paper", "door-lock", "m-senior")
     on = replace(config, bilevel=replace(config.bilevel, after_budget=True))

@@ -382,6 +382,7 @@ def test_the_size_of_the_bonus_stands_beside_that_of_the_learned_reward(tmp_path
             learned_return=[77, -100, 100, 50],
             beta=["", 0.05, 0.04, 0.01],
             bonus_mean=["", 2 * paid, paid, 0],
+            queried=[0, 50, 100, 100],
         )
     run_of(tmp_path, config_of("mrn"), files=("eval.csv", "train.csv"))
     runs = runs_below(tmp_path)
@@ -389,7 +390,7 @@ def test_the_size_of_the_bonus_stands_beside_that_of_the_learned_reward(tmp_path
     assert found is not None
     drawing, table = found
     assert [row[0] for row in table.rows] == ["m-rune"]
-    expected = ["m-rune", 2, 0.05, 0.01, 0.002, 0.2, 0.01]
+    expected = ["m-rune", 2, 0.05, 0.01, 0.002, 0.2, 0.01, 0.02]  # the last while 50 of 100 were asked: 0.004 / 0.2
     assert list(table.rows[0]) == [value if isinstance(value, str) else pytest.approx(value) for value in expected]
     assert [row["bonus"] for row in rows_of(drawing)] == pytest.approx([0.004, 0.002, 0])  # and no gaps between them
     (axis,) = drawing.figure.axes

@@ -99,7 +99,7 @@ class Training:
             if stop or step == last or not self.active():
                 return
 
-            plans = [due(trainee.config, step, trainee.progress.queried) for trainee in self.trainees]
+            plans = [due(one.config, step, one.progress.queried, one.session_open) for one in self.trainees]
             with self.clock.part("act"):
                 actions = self.runs.look(
                     acting,
@@ -207,7 +207,7 @@ class Training:
         warn = partial(self.warn, i)
         if heard:
             session.learn(trainee, self.runs, i, step, warn)
-        elif plan.session and not trainee.session_open:
+        elif plan.session:
             refused = session.hold(trainee, self.runs, i, step, plan.session, warn, partial(self.pause, i, step))
             if refused:
                 self.fail(i, step, refused)

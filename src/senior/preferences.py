@@ -252,8 +252,8 @@ class Preferences:
     def preferred_positions(self, position: slice, equal: str = "left_out") -> tuple[np.ndarray, int]:
         """Positions of all preferred segments, ``[capacity * H, d]`` of which the first ``count`` rows are filled.
 
-        Equal pairs are left out; if there is nothing else, both their segments count. ``equal="second"``: their second
-        segment counts, as by accident in the public code.
+        Equal pairs are left out; if there is nothing else, both their segments count, as far as there is room.
+        ``equal="second"``: their second segment counts, as by accident in the public code.
         """
         observation, _, second, count = self.arrays
         capacity, _, steps, _ = observation.shape

@@ -29,10 +29,11 @@ class Due(NamedTuple):
         return bool(self.session) or self.outer or self.refresh or self.begin
 
 
-def due(config: Config, step: int, queried: int) -> Due:
+def due(config: Config, step: int, queried: int, session_open: bool = False) -> Due:
     """What is due at ``step`` for a run that has asked ``queried`` pairs.
 
-    A session that was put off for lack of episodes is due again K steps later.
+    A session that was put off for lack of episodes is due again K steps later, as is one that would begin while an
+    earlier one is open.
     """
     until, random_steps = config.pretraining.until, config.pretraining.random_steps
     random = step < random_steps
@@ -43,7 +44,7 @@ def due(config: Config, step: int, queried: int) -> Due:
     queries = config.queries
     left = queries.budget - queried
     on_time = step == until or (step - until) % queries.every == 0
-    session = min(queries.per_session, left) if on_time and left > 0 else 0
+    session = min(queries.per_session, left) if on_time and left > 0 and not session_open else 0
     budget_left = left - session > 0
     outer = (
         config.method.outer == "bilevel"

@@ -31,7 +31,7 @@ class State(NamedTuple):
     beta: Float[Array, ""]
     preferred: Float[Array, "E d"]
     any_preferred: Bool[Array, ""]
-    refreshes: Int[Array, ""]
+    refreshes: Int[Array, ""]  # with both densities
     rows: Int[Array, " E"]  # of the replay, ascending, that the buffer was copied from
     filled: Int[Array, ""]  # rows of the replay at that refresh
 
@@ -121,7 +121,7 @@ class PreferenceGuided:
             intrinsic=jnp.where(state.any_preferred, value, 0.0),
             ready=state.any_preferred,
             beta=decayed(self.beta, self.decay, ticks),
-            refreshes=state.refreshes + 1,
+            refreshes=state.refreshes + state.any_preferred,
             rows=rows,
             filled=replay.filled,
         )

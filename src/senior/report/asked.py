@@ -32,6 +32,8 @@ class Asked(NamedTuple):
     """``[P, 2, H, d]``: the end-effector's path in both segments."""
     object: np.ndarray | None
     """``[P, 2, 3]``: where the object was when each segment began; None where it is not known."""
+    pretraining: np.ndarray
+    """``[P, 2]``: 1 where the segment is from before the end of pre-training, else 0; NaN without ``train.csv``."""
     returns: np.ndarray
     """``[P, 2]``: true return of each segment."""
     scores: list[dict[str, float]]
@@ -73,10 +75,10 @@ def asked(run: Run) -> Asked | None:
                 raise Unusable(f"{FILE} has schema version {version}; this program reads {SCHEMA_VERSION}")
             steps, size, _ = db.execute("SELECT * FROM shape").fetchone()
             rows = db.execute(
-                "SELECT id, session, step, observation, reward, scores, second, collected_step FROM pairs "
-                "WHERE reserve = 0 OR collected_step IS NOT NULL ORDER BY id"
+                "SELECT id, session, step, episode_0, episode_1, observation, reward, scores, second, collected_step "
+                "FROM pairs WHERE reserve = 0 OR collected_step IS NOT NULL ORDER BY id"
             )
-            return _arrays(rows, (2, steps, size), where, run.arm.task in TASKS)
+            return _arrays(rows, (2, steps, size), where, run.arm.task in TASKS, _first_episodes(run))
     except (sqlite3.Error, ValueError, TypeError) as error:
         raise Unusable(f"{FILE} is damaged: {error}") from error
 
@@ -87,7 +89,14 @@ def _open(path: Path) -> sqlite3.Connection:
     return sqlite3.connect(f"{path.absolute().as_uri()}?{how}", uri=True, timeout=BUSY_SECONDS)
 
 
-def _arrays(rows: sqlite3.Cursor, shape: tuple[int, int, int], where: slice, object_told: bool) -> Asked | None:
+def _first_episodes(run: Run) -> int | None:
+    """How many episodes had ended when pre-training did; None without ``train.csv``."""
+    return None if run.episodes is None else int((run.episodes.step <= run.main_phase).sum())
+
+
+def _arrays(
+    rows: sqlite3.Cursor, shape: tuple[int, int, int], where: slice, object_told: bool, first_episodes: int | None
+) -> Asked | None:
     numbers, position, objects, returns, scores, second, collected = [], [], [], [], [], [], []
     for *number, observation, reward, score, label, step in rows:
         seen = np.frombuffer(observation, "<f4").reshape(shape)
@@ -100,13 +109,15 @@ def _arrays(rows: sqlite3.Cursor, shape: tuple[int, int, int], where: slice, obj
         collected.append(step is not None)
     if not numbers:
         return None
-    ids, sessions, steps = np.array(numbers).T
+    ids, sessions, steps, *episodes = np.array(numbers).T
+    episode = np.stack(episodes, axis=1)
     return Asked(
         ids,
         sessions,
         steps,
         np.array(position, float),
         np.array(objects, float) if object_told else None,
+        np.full(episode.shape, np.nan) if first_episodes is None else (episode < first_episodes).astype(float),
         np.array(returns),
         scores,
         np.array(second),

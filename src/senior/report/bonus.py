@@ -8,7 +8,7 @@ buffer. Imports no JAX.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -228,15 +228,19 @@ class Size(NamedTuple):
     """Mean over a batch of what is added to the learned reward."""
     learned: np.ndarray
     """Size of the episode's mean learned reward per step."""
+    asking: np.ndarray
+    """Whether it ended before the last session."""
 
 
 def size_of(run: Run) -> Size:
     """The episodes at whose end a bonus was told, maybe none. Raises `Unusable`."""
-    welcome = ("episode_length", "learned_return", "beta", "bonus_mean")
+    welcome = ("episode_length", "learned_return", "beta", "bonus_mean", "queried")
     told = columns(run.path / "train.csv", ("step",), welcome)
     learned = np.abs(told["learned_return"] / told["episode_length"])
     paid = np.isfinite(told["bonus_mean"]) & np.isfinite(told["beta"]) & np.isfinite(learned)
-    return Size(told["step"][paid], told["beta"][paid], told["bonus_mean"][paid], learned[paid])
+    queried = told["queried"][paid]
+    asking = queried < queried.max(initial=-math.inf)
+    return Size(told["step"][paid], told["beta"][paid], told["bonus_mean"][paid], learned[paid], asking)
 
 
 def sizes(task: str, arms: Arms, look: Mapping[str, Look], left_out: list[LeftOut]) -> tuple[Drawing, Table] | None:
@@ -270,8 +274,14 @@ def sizes(task: str, arms: Arms, look: Mapping[str, Look], left_out: list[LeftOu
         axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.4)))
         legend(figure, axis)
     caption = f"{task}: exploration bonus and size of the learned reward, mean over seeds."
-    head = ("arm", "runs", "beta at first", "beta at last", "bonus", "learned reward", "bonus / learned reward")
-    about = f"{task}: size of exploration bonuses per step, from the first use to the end, mean over seeds."
+    head = (
+        *("arm", "runs", "beta at first", "beta at last", "bonus", "learned reward", "bonus / learned reward"),
+        "before the last session",
+    )
+    about = (
+        f"{task}: size of exploration bonuses, mean over the rows of a batch, from the first use to the end and, in "
+        "the last column, while there was something left to ask; mean over seeds."
+    )
     table = Table(about, head, [_row(label, own) for label, own in found.items()], f"{task}-bonus-size")
     return Drawing(f"{task}-bonus-size", caption, figure, rows), table
 
@@ -288,9 +298,19 @@ def _curve(own: Sequence[Size], name: str, edges: np.ndarray) -> np.ndarray:
 
 
 def _row(label: str, own: Sequence[Size]) -> Sequence[Cell]:
-    def mean(of: Callable[[Size], float]) -> float:
-        return float(np.mean([of(size) for size in own]))
+    first, last = (float(np.mean([size.beta[place] for size in own])) for place in (0, -1))
+    paid, learned = _means([(size.bonus, size.learned) for size in own])
+    early = _means([(size.bonus[size.asking], size.learned[size.asking]) for size in own if size.asking.any()])
+    return label, len(own), first, last, paid, learned, _share(paid, learned), _share(*early)
 
-    paid, learned = mean(lambda size: size.bonus.mean()), mean(lambda size: size.learned.mean())
-    first, last = mean(lambda size: size.beta[0]), mean(lambda size: size.beta[-1])
-    return label, len(own), first, last, paid, learned, paid / learned if learned else math.nan
+
+def _means(told: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:
+    """Of two columns the means over runs of those over their episodes; NaN of no run."""
+    if not told:
+        return math.nan, math.nan
+    first, second = np.mean([[column.mean() for column in columns] for columns in told], axis=0)
+    return float(first), float(second)
+
+
+def _share(part: float, whole: float) -> float:
+    return part / whole if whole else math.nan

@@ -43,9 +43,13 @@ TEXT_TABLE = (
     "What the chosen pairs are like, over all pairs but those of the first session. Length is that of the "
     "end-effector's path in a segment. The angle is that between the two displacements, from the beginning of a "
     "segment to its end; it is 90 degrees on average where the two have nothing to do with each other. The "
-    "difference is that of the two true returns, without its sign: the smaller it is, the harder the question."
+    "difference is that of the two true returns, without its sign: the smaller it is, the harder the question. Of "
+    "pre-training is the share of the segments that are of its episodes, by a policy that knew no reward."
 )
-HEAD = ("arm", "runs", "pairs", "path length", "angle (degrees)", "difference of returns", "equal", "skipped")
+HEAD = (
+    *("arm", "runs", "pairs", "path length", "angle (degrees)", "difference of returns", "of pre-training"),
+    *("equal", "skipped"),
+)
 
 
 def section(runs: Sequence[Run]) -> Section | None:
@@ -173,7 +177,7 @@ def _likeness(read: Sequence[Asked]) -> Sequence[Cell]:
     later = [pairs.session > pairs.session.min() for pairs in read]
     count = sum(int(rows.sum()) for rows in later)
     if not count:
-        return 0, *[math.nan] * 5
+        return 0, *[math.nan] * (len(HEAD) - 3)
 
     def joined(columns: Sequence[np.ndarray]) -> np.ndarray:
         return np.concatenate([column[rows] for column, rows in zip(columns, later, strict=True)])
@@ -185,6 +189,7 @@ def _likeness(read: Sequence[Asked]) -> Sequence[Cell]:
         float(joined([path_lengths(pairs.position) for pairs in read]).mean()),
         float(np.nanmean(angle)) if np.isfinite(angle).any() else math.nan,
         float(np.abs(joined([np.diff(pairs.returns)[:, 0] for pairs in read])).mean()),
+        float(joined([pairs.pretraining for pairs in read]).mean()),
         float(joined([pairs.second == 0.5 for pairs in read]).sum() / answered),
         float(joined([pairs.skipped for pairs in read]).sum() / answered),
     )
