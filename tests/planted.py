@@ -113,5 +113,5 @@ class Asking:
 def runs_below(*places: Path) -> tuple[Run, ...]:
     """As a report reads them, those under way too."""
     found = read(places, unfinished=True)
-    assert all(entry.path.suffix == ".csv" for entry in found.left_out), found.left_out  # files, and no run
+    assert all(entry.path.suffix in (".csv", ".sqlite") for entry in found.left_out), found.left_out  # files, and no run
     return found.runs

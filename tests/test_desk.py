@@ -571,10 +571,10 @@ def test_the_model_is_judged_by_what_it_foretold_of_decided_pairs_after_the_firs
     run.sql("UPDATE pairs SET prediction = CASE id % 4 WHEN 1 THEN 0.9 WHEN 2 THEN 0.2 ELSE 0.6 END")
     for number in range(1, 13):
         answer(desk, "ann", number, "left" if number % 4 in (1, 2) else "skip" if number < 9 else "equal")
-    assert desk.prospective() == []
+    assert desk.foretold() == []
     for _ in range(3):
         run.collect()
-    assert desk.prospective() == [(2005, 0.5, 2), (3005, 0.5, 2)]
+    assert desk.foretold() == [(2005, 1, 2), (3005, 1, 2)]
 
 
 def test_notes_and_names_of_clips_are_found(opened: Opener):

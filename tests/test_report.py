@@ -8,6 +8,8 @@ import io
 import json
 import math
 import re
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -22,6 +24,7 @@ from senior.cli.train import TrainOptions, starting_from
 from senior.config import Answering, Asking, Config, Evaluation, to_json
 from senior.methods import METHODS
 from senior.options import parse
+from senior.preference_file import Foretold
 from senior.presets import preset, release, with_budget
 from senior.report import across, sections
 from senior.report.bands import MOST, Band, Frame, banded
@@ -330,24 +333,32 @@ def train_csv(path: Path, lines: list[str]) -> None:
 
 
 def test_prospective_accuracy_is_of_the_latest_pairs_of_sessions_that_knew_something(tmp_path: Path):
-    path = evaluated(tmp_path / "run", config(), [0, 0, 0, 1])
-    train_csv(
-        path,
-        [
-            "9000,1,,0,0,",
-            "10500,1,1,40,40,0.1",  # the first session: nothing was known
-            "11000,1,1,40,40,0.1",
-            "15500,1,1,70,70,0.5",
-            "20500,1,1,90,90,1",
-            "25500,1,1,110,110,0",
-            "26000,1,1,110,110,0",
-        ],
-    )
+    evaluated(tmp_path / "run", config(), [0, 0, 0, 1])
     [run] = read([tmp_path]).runs
-    curve = across.prospective(run)
+    assert across.prospective(run) is None
+    told = [Foretold(15_500, 15, 30), Foretold(20_500, 20, 20), Foretold(25_500, 2, 20), Foretold(30_500, 40, 60)]
+    curve = across.prospective(replace(run, foretold=told))
     assert curve is not None
-    assert list(curve[0]) == [15_500, 20_500, 25_500]
-    assert curve[1] == pytest.approx([0.5, (15 + 20) / 50, (15 + 20 + 0) / 70])  # whole sessions, 50 pairs or more
+    assert list(curve[0]) == [15_500, 20_500, 25_500, 30_500]
+    whole = [15 / 30, (15 + 20) / 50, (15 + 20 + 2) / 70, 40 / 60]  # sessions, of 50 pairs or more together
+    assert curve[1] == pytest.approx(whole)
+
+
+def test_predictions_are_read_from_the_preference_file_and_damage_is_told(tmp_path: Path):
+    path = write_run(tmp_path / "run", config(), files=("eval.csv", "preferences.sqlite"))
+    with closing(sqlite3.connect(path / "preferences.sqlite")) as db:
+        pairs = db.execute("SELECT session, step, prediction, second FROM pairs").fetchall()
+    per_session = config().queries.per_session
+    [run] = read([tmp_path]).runs
+    assert len(run.foretold) == len(pairs) // per_session - 1  # nothing was known before the first
+    for number, session in enumerate(run.foretold, 1):
+        own = pairs[number * per_session : (number + 1) * per_session]
+        right = sum((prediction > 0.5) == second for _, _, prediction, second in own)
+        assert session == (own[0][1], right, per_session)
+    (path / "preferences.sqlite").write_bytes(b"no database at all" * 100)
+    found = read([tmp_path])
+    assert not found.runs[0].foretold
+    assert "preferences.sqlite is damaged" in " ".join(entry.reason for entry in found.left_out)
 
 
 def test_returns_are_correlated_over_the_main_phase(tmp_path: Path):

@@ -157,6 +157,16 @@ class Asked(NamedTuple):
         return sum(told) / len(told) if told else None
 
 
+class Foretold(NamedTuple):
+    """A session that the reward model judged before it was fitted to it."""
+
+    step: int
+    """At which it was trained on."""
+    right: int
+    decided: int
+    """Pairs of which one segment was preferred."""
+
+
 def _second(said: Said, soft: bool) -> float:
     if said.answer == Preferred.EQUAL:
         return 0.5
@@ -179,6 +189,23 @@ def asked_of(pairs: Iterable[Asked], rules: Rules) -> list[Asked]:
                 chosen.append(more)
         asked += chosen
     return asked
+
+
+def foretold(db: sqlite3.Connection) -> list[Foretold]:
+    """Of every session that was trained on after the first: how often the reward model was right before the fit to it.
+
+    Sessions without a decided pair are left out.
+    """
+    rows = db.execute(
+        "SELECT session, collected_step, (prediction > 0.5) = (second > 0.5) FROM pairs "
+        "WHERE session > (SELECT MIN(session) FROM pairs WHERE second IS NOT NULL) "
+        "AND second IS NOT NULL AND second != 0.5 AND prediction IS NOT NULL ORDER BY id"
+    )
+    found: dict[int, Foretold] = {}
+    for session, step, right in rows:
+        before = found.get(session, Foretold(step, 0, 0))
+        found[session] = Foretold(step, before.right + right, before.decided + 1)
+    return list(found.values())
 
 
 def connect(path: Path) -> sqlite3.Connection:

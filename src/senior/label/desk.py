@@ -15,7 +15,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Literal, NamedTuple
 
-from senior.preference_file import Asked, Rules, asked_of, connect, pairs_of, transaction
+from senior.preference_file import Asked, Foretold, Rules, asked_of, connect, foretold, pairs_of, transaction
 from senior.types import Preferred
 
 LEASE_SECONDS = 120.0
@@ -335,23 +335,10 @@ class Desk:
                 "SELECT pair, annotator, answer FROM answers WHERE withdrawn IS NULL ORDER BY id"
             ).fetchall()
 
-    def prospective(self) -> list[tuple[int, float, int]]:
-        """Of every session that was trained on: step, share of its pairs foretold before the fit, decided pairs.
-
-        Sessions before the first fit, and those without a decided pair, are left out.
-        """
+    def foretold(self) -> list[Foretold]:
+        """`senior.preference_file.foretold` of this run."""
         with self._lock:
-            rows: Sequence[tuple[int, int, float, float]] = self._db.execute(
-                "SELECT session, collected_step, prediction, second FROM pairs "
-                "WHERE session > (SELECT MIN(session) FROM pairs WHERE second IS NOT NULL) "
-                "AND second IS NOT NULL AND second != 0.5 AND prediction IS NOT NULL ORDER BY id"
-            ).fetchall()
-        found = []
-        for session in dict.fromkeys(row[0] for row in rows):
-            own = [row for row in rows if row[0] == session]
-            right = sum((prediction > 0.5) == (second > 0.5) for _, _, prediction, second in own)
-            found.append((own[0][1], right / len(own), len(own)))
-        return found
+            return foretold(self._db)
 
     # Words.
 

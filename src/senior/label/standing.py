@@ -83,7 +83,7 @@ class Standing:
         from senior.label import agreement  # brings statistics that take seconds to import
 
         steps, success, returns = _curve(self.path / "eval.csv")
-        prospective = self.desk.prospective()
+        sessions = self.desk.foretold()
         return {
             "run": self.title,
             "goal": self.goal,
@@ -91,9 +91,9 @@ class Standing:
             "annotators": self.desk.annotators(),
             "curve": {"step": steps, "success": success, "return": returns},
             "prospective": {
-                "step": [row[0] for row in prospective],
-                "accuracy": [row[1] for row in prospective],
-                "pairs": [row[2] for row in prospective],
+                "step": [one.step for one in sessions],
+                "accuracy": [one.right / one.decided for one in sessions],
+                "pairs": [one.decided for one in sessions],
             },
         }
 

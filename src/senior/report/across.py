@@ -26,7 +26,7 @@ from senior.report.tables import Cell
 Runs = Mapping[str, Sequence[Run]]
 """Runs by the label of their arm."""
 PAIRS = 50
-"""Latest asked pairs over which prospective accuracy is taken."""
+"""Latest decided pairs over which prospective accuracy is taken."""
 STEPS = "environment steps"
 
 _BUDGET = re.compile(r" --budget \d+")
@@ -54,24 +54,18 @@ def against_labels(run: Run) -> Curve:
 
 
 def prospective(run: Run) -> Curve | None:
-    """Step of each session and the share of right predictions among the latest `PAIRS` asked pairs; None of no session.
+    """Step of each session, and the share of the latest `PAIRS` decided pairs predicted rightly; None of no session.
 
     A prediction is made before the reward model is fitted to the pair. The first session is left out: nothing was
     learned before it.
     """
-    if run.episodes is None:
+    if not run.foretold:
         return None
-    told = run.episodes
-    before = np.concatenate([[0.0], told.labels[:-1]])
-    asked = np.diff(told.queried, prepend=0.0)
-    session = (asked > 0) & (before > 0) & np.isfinite(told.reward_accuracy)
-    if not session.any():
-        return None
-    pairs, right = asked[session], (asked * told.reward_accuracy)[session]
-    total, total_right = np.concatenate([[0.0], pairs.cumsum()]), np.concatenate([[0.0], right.cumsum()])
-    first = np.searchsorted(total, total[1:] - PAIRS, side="left")
-    first = np.minimum(first, np.arange(len(pairs)))
-    return told.step[session], (total_right[1:] - total_right[first]) / (total[1:] - total[first])
+    step, right, decided = np.array(run.foretold, float).T
+    total, total_right = np.concatenate([[0.0], decided.cumsum()]), np.concatenate([[0.0], right.cumsum()])
+    first = np.searchsorted(total, total[1:] - PAIRS, side="right") - 1
+    first = np.clip(first, 0, np.arange(len(decided)))
+    return step, (total_right[1:] - total_right[first]) / (total[1:] - total[first])
 
 
 @styled

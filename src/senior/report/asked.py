@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from contextlib import closing
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from senior.envs.metaworld import POSITION, TASKS
-from senior.preference_file import BUSY_SECONDS, SCHEMA_VERSION
-from senior.report.records import Run, Unusable
+from senior.report.records import PREFERENCES, Run, Unusable, preferences_in
 
-FILE = "preferences.sqlite"
 OBJECT = slice(4, 7)
 """Where Meta-World's observation holds the place of the object, in metres."""
 
@@ -62,31 +58,19 @@ def asked(run: Run) -> Asked | None:
 
     The file is only read, and nothing is left beside it.
     """
-    path = run.path / FILE
+    path = run.path / PREFERENCES
     if not run.asks or not path.exists():
         return None
     where = place_of(run)
     if where is None:
-        raise Unusable(f"{FILE} cannot be used: config.json does not say where the position lies")
-    try:
-        with closing(_open(path)) as db:
-            version = db.execute("PRAGMA user_version").fetchone()[0]
-            if version != SCHEMA_VERSION:
-                raise Unusable(f"{FILE} has schema version {version}; this program reads {SCHEMA_VERSION}")
-            steps, size, _ = db.execute("SELECT * FROM shape").fetchone()
-            rows = db.execute(
-                "SELECT id, session, step, episode_0, episode_1, observation, reward, scores, second, collected_step "
-                "FROM pairs WHERE reserve = 0 OR collected_step IS NOT NULL ORDER BY id"
-            )
-            return _arrays(rows, (2, steps, size), where, run.arm.task in TASKS, _first_episodes(run))
-    except (sqlite3.Error, ValueError, TypeError) as error:
-        raise Unusable(f"{FILE} is damaged: {error}") from error
-
-
-def _open(path: Path) -> sqlite3.Connection:
-    """Open it to be read. While a run writes it there is a log beside it; without one, opening it would make one."""
-    how = "mode=ro" if path.with_name(path.name + "-wal").exists() else "immutable=1"
-    return sqlite3.connect(f"{path.absolute().as_uri()}?{how}", uri=True, timeout=BUSY_SECONDS)
+        raise Unusable(f"{PREFERENCES} cannot be used: config.json does not say where the position lies")
+    with preferences_in(path) as db:
+        steps, size, _ = db.execute("SELECT * FROM shape").fetchone()
+        rows = db.execute(
+            "SELECT id, session, step, episode_0, episode_1, observation, reward, scores, second, collected_step "
+            "FROM pairs WHERE reserve = 0 OR collected_step IS NOT NULL ORDER BY id"
+        )
+        return _arrays(rows, (2, steps, size), where, run.arm.task in TASKS, _first_episodes(run))
 
 
 def _first_episodes(run: Run) -> int | None:

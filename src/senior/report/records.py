@@ -11,7 +11,9 @@ from __future__ import annotations
 import csv
 import json
 import math
+import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from senior.config import Config, from_json, to_json
+from senior.preference_file import BUSY_SECONDS, SCHEMA_VERSION, Foretold, foretold
 from senior.report.names import label, normal, options
 from senior.types import BadInput
 
@@ -28,6 +31,7 @@ PROTOCOL = ("reward_version", "horizon", "observation_size")
 """Of the protocol, what numbers depend on,"""
 PACKAGES = ("senior-rl", "metaworld", "mujoco")
 """and the packages whose versions do."""
+PREFERENCES = "preferences.sqlite"
 NOT_TOLD = "not told"
 Fingerprint = tuple[tuple[str, str], ...]
 """All that a number depends on, as names and values."""
@@ -88,8 +92,6 @@ class Episodes(NamedTuple):
     learned_return: np.ndarray
     queried: np.ndarray
     labels: np.ndarray
-    reward_accuracy: np.ndarray
-    """Of the latest session: the model's prediction of its pairs before it was fitted to them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +115,8 @@ class Run:
     evaluation: Evaluations
     episodes: Episodes | None
     """None where ``train.csv`` cannot be read."""
+    foretold: Sequence[Foretold]
+    """Empty where nobody is asked, and where ``preferences.sqlite`` is not there or cannot be read."""
     seconds: float | None
     """Wall time of training up to the last evaluation, pauses between processes left out; None where not told."""
 
@@ -156,6 +160,7 @@ def read_run(path: Path, known: dict[str, Config | None], left_out: list[LeftOut
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise Unusable(f"config.json is damaged: {error}") from error
     arm = Arm(task, method if config is None else label(config), fingerprint)
+    preferences = path / PREFERENCES
     evaluation = _evaluations(path / "eval.csv")
     return Run(
         path,
@@ -169,6 +174,7 @@ def read_run(path: Path, known: dict[str, Config | None], left_out: list[LeftOut
         protocol,
         evaluation,
         _or_none(_episodes, path / "train.csv", left_out),
+        (_or_none(_foretold, preferences, left_out) if asks and preferences.exists() else None) or (),
         _or_none(_seconds, path / "timing.csv", left_out),
     )
 
@@ -254,6 +260,26 @@ def columns(path: Path, needed: Sequence[str], welcome: Sequence[str] = ()) -> d
         raise Unusable(f"{path.name} is damaged: {error}") from error
 
 
+@contextmanager
+def preferences_in(path: Path) -> Iterator[sqlite3.Connection]:
+    """A preference file, to be read: nothing is left beside it. Whatever is wrong with it is raised as `Unusable`."""
+    # while a run writes it there is a log beside it; without one, opening it would make one
+    how = "mode=ro" if path.with_name(path.name + "-wal").exists() else "immutable=1"
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{how}", uri=True, timeout=BUSY_SECONDS)) as db:
+            version = db.execute("PRAGMA user_version").fetchone()[0]
+            if version != SCHEMA_VERSION:
+                raise Unusable(f"{path.name} has schema version {version}; this program reads {SCHEMA_VERSION}")
+            yield db
+    except (sqlite3.Error, ValueError, TypeError) as error:
+        raise Unusable(f"{path.name} is damaged: {error}") from error
+
+
+def _foretold(path: Path) -> list[Foretold]:
+    with preferences_in(path) as db:
+        return foretold(db)
+
+
 def _evaluations(path: Path) -> Evaluations:
     needed = ("step", "labels", "queried", "episodes", "return_mean", "success_rate")
     found = columns(path, needed)
@@ -262,6 +288,8 @@ def _evaluations(path: Path) -> Evaluations:
         raise Unusable("it was not evaluated yet")
     if not all(np.isfinite(found[name]).all() for name in needed[:-1]):
         raise Unusable(f"{path.name} is damaged: cells are missing")
+    if not (found["episodes"] >= 1).all():
+        raise Unusable(f"{path.name} is damaged: an evaluation has no episode")
     if not (np.diff(step) > 0).all():
         raise Unusable(f"{path.name} is damaged: its steps do not increase")
     told = ~np.isnan(success)

@@ -190,7 +190,7 @@ def reward_model(tasks: Tasks, looks: Mapping[str, Look]) -> Section | None:
                 for measure in (correlation, rank_correlation)
             )
             found = [count for run in told if (count := _found(run)) is not None]
-            if accuracy or linear:
+            if accuracy or linear or found:
                 cells = [plus_minus(values) for values in (accuracy, linear, ranks, found)]
                 rows.append([task, label, len(told), *cells])
     if not rows:
