@@ -113,5 +113,6 @@ class Asking:
 def runs_below(*places: Path) -> tuple[Run, ...]:
     """As a report reads them, those under way too."""
     found = read(places, unfinished=True)
-    assert all(entry.path.suffix in (".csv", ".sqlite") for entry in found.left_out), found.left_out  # files, and no run
+    files = all(entry.path.suffix in (".csv", ".sqlite") for entry in found.left_out)  # and no run
+    assert files, found.left_out
     return found.runs

@@ -157,6 +157,7 @@ def test_numbers_that_make_no_sense(options: str, capsys: pytest.CaptureFixture[
 
 
 COMBINATIONS = {
+    "--teacher human --seeds 2 --port 9000": "--port 9000 is for one page, and each of 2 runs has its own",
     "--select none": "no reward model, so an outer step (bilevel) makes no sense",
     "--method sac --explore preference_guided": "no reward model, so a bonus",
     "--method sac --mix curiosity": "no reward model, so a mix of sources",
@@ -170,6 +171,7 @@ COMBINATIONS = {
     "--method qpa --select kcenter_disagreement": "so --select kcenter_disagreement needs --reward.members 2",
     "--method rune --reward.members 1": "One member cannot disagree with itself",
     "--method qpa --explore disagreement": "so --explore disagreement needs --reward.members 2 or more",
+    "--method sac --compat release": "--compat release is about m-senior",
     "--method p-senior --compat release": "--compat release is about m-senior",
     "--compat release --beta-clock refresh": "With pge.clock refresh this is not what the public code does",
     "--compat release --bandwidth-mds 0.3": "With mds.bandwidth 0.3 this is not what the public code does",

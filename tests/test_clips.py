@@ -379,7 +379,9 @@ def test_the_first_pair_is_ready_first(tmp_path: Path):
     cuts: list[Cut] = [((0, 2), (1, 2)), ((2, 5), (2, 17)), ((3, 12), (3, 1)), ((0, 3), (0, 3))]
     asked(tmp_path, config, episodes, cuts, reserves=1)
     asked(tmp_path, config, episodes, [((1, 5), (0, 9)), ((1, 0), (0, 19))])
-    execute(tmp_path, "UPDATE pairs SET collected_step = 100 WHERE id = 1")
+    asked(tmp_path, config, episodes, [((3, 0), (3, 2)), ((2, 0), (2, 9))], reserves=1)
+    execute(tmp_path, "UPDATE pairs SET session = 0 WHERE id IN (1, 7, 8)")  # trained on, and a reserve left over
+    execute(tmp_path, "UPDATE pairs SET collected_step = 100 WHERE id IN (1, 7)")
     Counting.resets = 0
     stage = here(tmp_path, config)
     # a pair's segments in the order in which its episodes go on, the one asked in place of another at last
@@ -454,7 +456,7 @@ def test_a_failure_is_tried_again_by_the_next_process(tmp_path: Path, monkeypatc
     config = replace(config, env="nowhere:Robot")
     here(tmp_path, config)
     assert all("nowhere" in row["failure"] for row in clips(tmp_path)) and len(clips(tmp_path)) == 6
-    execute(tmp_path, "UPDATE pairs SET collected_step = 100 WHERE id = 2")
+    execute(tmp_path, "UPDATE pairs SET session = 0, collected_step = 100 WHERE id = 2")
     here(tmp_path, configuration(Counting))
     assert [row["pair"] for row in clips(tmp_path, "failure IS NULL")] == [1, 1, 3, 3]
     assert [row["pair"] for row in clips(tmp_path, "failure IS NOT NULL")] == [2, 2]
@@ -535,7 +537,7 @@ def test_clips_are_cut_from_what_was_filmed(tmp_path: Path):
 
     def record(first: int, steps: int) -> tuple[dict[int, list[Step]], dict[int, list[np.ndarray]]]:
         place = Local(lambda: envs.make(**made_by(config), render=True), config.seed, TRAINING)
-        recording = Recording(place, live, keep=2)
+        recording = Recording(place, live, keep=2, segment=H)
         assert recording.begin(first, afresh=True) is None
         episodes: dict[int, list[Step]] = {}
         scenes: dict[int, list[np.ndarray]] = {}
@@ -584,9 +586,29 @@ def test_clips_are_cut_from_what_was_filmed(tmp_path: Path):
     ]
 
 
+def test_films_are_kept_of_the_latest_episodes_that_pairs_are_cut_from(tmp_path: Path):
+    """Short ones are none of them."""
+    place = Local(lambda: envs.make(**made_by(configuration(Forgetful)), render=True), 0, TRAINING)
+    recording = Recording(place, tmp_path, keep=2, segment=HORIZON)
+    recording.begin(0, afresh=True)
+    acted(recording, 0, 0)
+    recording.segment = H
+    recording.begin(4)
+    for step in range(2 * HORIZON):
+        acted(recording, place.episode, step)
+    recording.segment = HORIZON
+    for step in range(3 * HORIZON):
+        acted(recording, place.episode, step)
+    assert {path.name for path in tmp_path.glob("*.mp4")} == {"episode-4.mp4", "episode-5.mp4"}
+    recording.begin(5)  # goes on from a checkpoint before that one
+    assert {path.name for path in tmp_path.glob("*.mp4")} == {"episode-4.mp4"}
+    assert {path.name for path in tmp_path.glob("*.npy")} == {"episode-4.npy"}
+    recording.close()
+
+
 def test_a_run_goes_on_where_nothing_can_be_filmed(tmp_path: Path):
     place = Local(lambda: envs.make(**made_by(configuration(Blind)), render=True), 0, TRAINING)
-    recording = Recording(place, tmp_path, keep=2)
+    recording = Recording(place, tmp_path, keep=2, segment=H)
     assert recording.begin(0) is None
     for step in range(2 * HORIZON):
         acted(recording, 0, step)

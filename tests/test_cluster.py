@@ -6,7 +6,9 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,41 @@ def test_a_cluster_finishes_all_cells_though_a_worker_is_killed(cluster: Cluster
         run = killed.with_name(f"seed-{seed}")
         assert_same_run(run, undisturbed / "point" / "m-senior" / run.name, interrupted=seed == 0)
     assert not list(out.glob("sweep-*")), "what marks the shared folder is gone"
+
+
+def hands(cluster: Cluster) -> set[int]:
+    """The cluster's actors of sweeps."""
+    token, found = cluster.environment["RAY_AUTH_TOKEN"].encode(), set()
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if (process / "cmdline").read_bytes().startswith(b"ray::Hand") and token in (
+                process / "environ"
+            ).read_bytes():
+                found.add(int(process.name))
+    return found
+
+
+def test_actors_that_are_lost_idle_or_as_they_begin_cost_no_cell_a_try(cluster: Cluster, tmp_path: Path):
+    command = [sys.executable, "-m", "senior.cli", "sweep", *OPTIONS, "--seed", "0", "--out", str(tmp_path)]
+    with subprocess.Popen(
+        [*command, "--ray", cluster.address],
+        env=cluster.environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as sweep:
+        busy = worker_of(tmp_path / "point" / "m-senior" / "seed-0", 450)
+        first = hands(cluster)
+        assert busy in first and len(first) == 2
+        for lost in (*(first - {busy}), busy):
+            os.kill(lost, signal.SIGKILL)
+        while not (new := hands(cluster) - first):
+            assert sweep.poll() is None
+            time.sleep(0.01)
+        os.kill(new.pop(), signal.SIGKILL)
+        told, complained = sweep.communicate(timeout=300)
+    assert sweep.returncode == DONE, complained
+    assert complained.count("its worker was lost") == 1 and "1 of 1 cells are finished" in told
 
 
 def test_interrupted_it_is_saved_on_all_nodes(cluster: Cluster, tmp_path: Path):

@@ -323,7 +323,7 @@ def test_a_recorded_teacher_is_asked_nothing_and_says_nothing():
 # There and back.
 
 NAME = st.text(st.characters(exclude_categories=("Cc", "Cs")), min_size=1, max_size=8)
-NUMBER = st.floats(allow_nan=False, allow_infinity=False, min_value=0, max_value=1e12)
+NUMBER = st.floats(allow_nan=False, allow_infinity=False, min_value=0, max_value=99e9)
 DIGEST = st.text("0123456789abcdef", min_size=64, max_size=64)
 SAID = st.fixed_dictionaries(
     {
@@ -455,8 +455,13 @@ DAMAGE = {
     ),
     "half an answer": (at(4, "answers", 0, "answer", value=0.5), "line 4: answer must be .*not 0.5"),
     "an unknown strength": (at(2, "answers", 0, "strength", value="very"), 'line 2: strength must be .*not "very"'),
-    "an endless time": (at(2, "answers", 0, "answered_at", value=float("inf")), "line 2: answered_at must be a fin"),
-    "time backwards": (at(2, "answers", 0, "seconds", value=-1), "line 2: seconds must be a finite number, 0 or more"),
+    "an endless time": (
+        at(2, "answers", 0, "answered_at", value=float("inf")),
+        "line 2: answered_at must be a time in",
+    ),
+    "a time in milliseconds": (at(2, "answers", 0, "answered_at", value=1.8e12), "line 2: answered_at must be a time"),
+    "a time beyond measure": (at(2, "answers", 0, "seconds", value=2**70), "line 2: seconds must be a number of seco"),
+    "time backwards": (at(2, "answers", 0, "seconds", value=-1), "line 2: seconds must be a number of seconds, 0 or m"),
     "nobody": (at(2, "answers", 0, "annotator", value=""), "line 2: annotator must be a name"),
     "a name that rings": (at(2, "answers", 0, "annotator", value="\a"), "line 2: annotator must be a name"),
     "a name that is no text": (at(2, "answers", 0, "annotator", value="\ud800"), "line 2: annotator must be a name"),

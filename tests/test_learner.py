@@ -557,6 +557,25 @@ class Swallower(Scripted):
         return replace(answers, labels=answers.labels[1:])
 
 
+class Reckoner(Scripted):
+    """Answers in NumPy's numbers."""
+
+    def collect(self) -> Answers:
+        answers = super().collect()
+        return Answers([*np.array(answers.ids, np.int64)], [*np.array(answers.labels, np.int64)])  # pyright: ignore
+
+
+def test_numbers_of_numpy_are_answers_like_others(tmp_path: Path):
+    (ours,) = train(replace(CONFIG, teacher=f"{__name__}:Scripted"), tmp_path / "ours")
+    (theirs,) = train(replace(CONFIG, teacher=f"{__name__}:Reckoner"), tmp_path / "theirs")
+    assert ours.finished and theirs.finished
+
+    def said(path: Path) -> list[list[object]]:
+        return [[answer[1] for answer in row[-1]] for row in preferences_dump(path)]
+
+    assert said(theirs.path) == said(ours.path) and {1} < {x for row in said(ours.path) for x in row}
+
+
 @pytest.mark.parametrize("teacher", ["Mumbler", "Stranger", "Stutterer", "Swallower"])
 def test_a_teacher_who_makes_no_sense_stops_its_run_and_nothing_of_what_it_said_stays(teacher: str, tmp_path: Path):
     (result,) = train(replace(CONFIG, teacher=f"{__name__}:{teacher}"), tmp_path)

@@ -349,6 +349,19 @@ def test_the_last_answer_can_be_thought_over_before_a_session_is_ready(opened: O
     assert preferences.ready(0, STEP, ONE) and not preferences.ready(0, STEP, ONE, settle=60)
     set_times(file, time.time() - 61)
     assert preferences.ready(0, STEP, ONE, settle=60)
+    set_times(file, time.time() + 3600)  # of a machine whose clock is ahead
+    assert preferences.ready(0, STEP, ONE) and preferences.ready(0, STEP, ONE, settle=60)
+
+
+RULES: list[dict[str, np.ndarray]] = [{"m": np.ones(1)}, {"disagreement": np.full(1, 2.0)}, {}]
+
+
+def test_pairs_of_two_rules_can_be_put_together(opened: Opener):
+    preferences = opened()
+    ids = [ask(preferences, replace(query_of(1), scores=scores), number)[0] for number, scores in enumerate(RULES)]
+    found = preferences.query(ids, 0.0).scores
+    np.testing.assert_array_equal(found["m"], [1, np.nan, np.nan])
+    np.testing.assert_array_equal(found["disagreement"], [np.nan, 2, np.nan])
 
 
 def test_what_was_undone_in_the_last_moment_is_not_collected(opened: Opener, file: Path):

@@ -227,6 +227,7 @@ BROKEN = {
     "no number": ("eval.csv", HEAD + b"10000,0,0,ten,0,1,1\n", "damaged"),
     "no return": ("eval.csv", HEAD + b"40000,0,0,10,0.5,,1\n", "cells are missing"),
     "back in time": ("eval.csv", HEAD + b"40000,0,0,10,0,1,1\n20000,0,0,10,0,1,1\n", "do not increase"),
+    "no episodes": ("eval.csv", HEAD + b"40000,0,0,0,0.5,1,1\n", "an evaluation has no episode"),
     "no rate": ("eval.csv", HEAD + b"40000,0,0,10,1.5,1,1\n", "between 0 and 1"),
     "some rates": ("eval.csv", HEAD + b"20000,0,0,10,,1,1\n40000,0,0,10,1,1,1\n", "success rates are missing"),
     "zeros": ("eval.csv", HEAD + b"40000,0,0,10,\0,1,1\n", "damaged"),
@@ -325,6 +326,13 @@ def test_the_clock_of_a_resumed_run_goes_on(tmp_path: Path):
     path = write_run(tmp_path / "run", config(), files=CSV_FILES)
     (path / "timing.csv").write_text("step,seconds\n10000,100\n20000,220\n30000,50\n40000,90\n")
     assert read([tmp_path]).runs[0].seconds == 220 + 90
+
+
+def test_a_clock_that_began_anew_is_known_by_the_rate_it_does_not_fit(tmp_path: Path):
+    path = write_run(tmp_path / "run", config(), files=CSV_FILES)
+    head = "step,seconds,steps_per_second\n10000,165,60.6060606\n"  # killed after it; what follows began anew there
+    (path / "timing.csv").write_text(f"{head}20000,170,58.8235294\n30000,340,58.8235294\n40000,510,58.8235294\n")
+    assert read([tmp_path]).runs[0].seconds == pytest.approx(165 + 510)
 
 
 def train_csv(path: Path, lines: list[str]) -> None:
@@ -738,6 +746,21 @@ def test_budgets_stand_beside_each_other(tmp_path: Path):
     assert [row[1:4] for row in drawing.rows[1:]] == [("m-senior", 250, 2), ("m-senior", 500, 2)]
     assert [row[4] for row in drawing.rows[1:]] == pytest.approx([0.55, 0.95])
     assert across.budget_curves("door-lock", {"mrn": arms["mrn"]}) is None
+
+
+def test_budgets_of_two_protocols_are_two_lines(tmp_path: Path):
+    for name, method, budgets in (("paper", "m-senior", (500, 1000)), ("quick", "m-senior", (250, 500))):
+        for budget in budgets:
+            own = with_budget(preset(name, "door-open", method), budget)
+            success = [budget / 2000] * 3 + [budget / 1000]
+            evaluated(tmp_path / name / str(budget), replace(own, steps=40_000), success)
+    arms = sections.by_task(read([tmp_path]).runs)["door-open"]
+    drawing = across.budget_curves("door-open", arms)
+    assert drawing is not None
+    told = {row[1:3]: row[4] for row in drawing.rows[1:]}
+    assert {budget for _, budget in told} == {250, 500, 1000} and len(told) == 4
+    assert all(mean == budget / 1000 for (_, budget), mean in told.items())
+    assert len({label for label, _ in told}) == 2
 
 
 def test_what_all_arms_have_is_told_once(tmp_path: Path):

@@ -205,7 +205,7 @@ def test_only_the_studys_own_runs_count_and_only_those_of_one_protocol(tmp_path:
     assert [run.seed for run in found["mrn", "door-lock"]] == [0, 1, 2]
     assert refused == [
         f"Not judged: {place / 'seed-5'}: no run of its arm at the scale quick.",
-        f"Not judged: {place / 'seed-3'} and 1 more: a protocol that most runs beside it do not have.",
+        f"Not judged: {place / 'seed-3'} and 1 more: another protocol than the runs beside it that count.",
     ]
     at_paper, _ = reproduce.runs_by_arm(studies.values(), "paper", tmp_path, runs)
     assert not at_paper
@@ -234,6 +234,30 @@ def test_the_cells_of_a_study_can_be_listed(tmp_path: Path, capsys: pytest.Captu
 
 
 # The command.
+
+
+def test_a_study_without_any_of_the_tasks_is_told_of(tmp_path: Path):
+    studies = reproduce.studies_of(["main", "quality"], ("window-open",))
+    assert not studies["quality"].tasks
+    arm = next(arm for arm in studies["main"].arms if arm.name == "mrn")
+    write_run(
+        reproduce.folder(tmp_path, arm, "window-open", "quick") / "seed-0",
+        configuration(arm, "window-open", 0, "quick"),
+        files=("eval.csv",),
+    )
+    told = reproduce.write(studies, "quick", tmp_path)
+    assert "Left out on demand: door-lock, window-close, handle-press, door-open, door-unlock." in told
+    own = [claim for claim in CLAIMS if claim.table == "quality"]
+    assert told.count("  missing ") >= len(own) > 0
+
+
+def test_runs_that_do_not_count_are_told_once_however_many_studies_have_them(tmp_path: Path):
+    studies = reproduce.studies_of(["main", "ablation"], ("door-lock",))
+    arm = next(arm for arm in studies["main"].arms if arm.name == "mrn")
+    config = replace(configuration(arm, "door-lock", 5, "quick"), steps=50_000)
+    path = write_run(reproduce.folder(tmp_path, arm, "door-lock", "quick") / "seed-5", config, files=("eval.csv",))
+    _, refused = reproduce.runs_by_arm(studies.values(), "quick", tmp_path, read([tmp_path]).runs)
+    assert refused == [f"Not judged: {path}: no run of its arm at the scale quick."]
 
 
 def test_what_the_paper_has_not_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

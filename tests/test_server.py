@@ -718,6 +718,9 @@ def test_what_cannot_be_served_is_told_in_a_sentence(fresh: StandIn, tmp_path: P
     for token in ("a b", "a;b", "ключ", "a&b", 'a"b', "a\nb"):
         assert "can stand in a token" in refused(fresh.path, Address(token=token))
     assert "Cannot listen on 192.0.2.1, port 8642: " in refused(fresh.path, Address(host="192.0.2.1"))
+    (fresh.path / "label" / "clips").rmdir()
+    (fresh.path / "label" / "clips").write_text("in the way")
+    assert "a file where a directory should be" in refused(fresh.path)
     plain = replace(fresh.config, method=methods.method("sac"))
     (fresh.path / "config.json").write_text(json.dumps({"config": to_json(plain), "protocol": {}}))
     assert "true reward" in refused(fresh.path)
@@ -760,6 +763,21 @@ def test_other_machines_get_in_by_address_name_and_allowed_name_only():
     assert not any(
         guard._is_ours(host) for host in ("evil.example", "robot.example.evil.example", "", "10.0.0.7.evil.example")
     )
+
+
+def test_the_address_that_is_printed_is_let_in():
+    access = served.access_to(Address(host="127.0.0.2"), 8642, "x")
+    assert Guard(lambda *_: None, access)._is_ours("127.0.0.2:8642")  # type: ignore[arg-type]
+
+
+def test_where_a_run_was_is_not_forgotten_when_it_cannot_be_served(fresh: StandIn):
+    fresh.ask(1)
+    before = Served("127.0.0.1", 9, "kept", 1, "user")
+    (fresh.path / "label").mkdir(exist_ok=True)
+    before.write(fresh.path)
+    assert "Cannot listen" in refused(fresh.path, Address(host="192.0.2.1", token="other"))
+    assert Served.find(fresh.path) == before
+    assert not (fresh.path / "label" / "token").exists()
 
 
 # What it survives.

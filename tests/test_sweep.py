@@ -33,6 +33,7 @@ from senior.sweep.scheduler import RETRIES, Sweep
 from senior.sweep.worker import Watch, train
 from senior.types import BadInput
 from tests.equal import OPTIONS, assert_same_run, short
+from tests.small import small
 
 GRID = """
 task = "point"
@@ -111,6 +112,8 @@ def test_options_beside_a_file_win():
         ("task = [", "cannot be read"),
         ("task = [['a']]", "task must be a value or a list of values"),
         ("wait = [true, false]", "wait must be true or false"),
+        ("wait = []", "wait must be true or false"),
+        ('wait = "false"', "wait must be true or false"),
     ],
 )
 def test_a_file_that_is_no_grid_is_refused(content: str, said: str, tmp_path: Path):
@@ -161,6 +164,17 @@ def test_what_makes_no_sense_in_a_file_is_told_with_the_file(
     arguments = ["sweep", "--out", str(tmp_path / "out"), "--file", str(tmp_path / "grid.toml"), *beside.split()]
     assert main(arguments) == BAD_INPUT
     assert said in capsys.readouterr().err
+
+
+def test_values_that_differ_in_sign_have_directories_of_their_own(tmp_path: Path):
+    found = cells_of({"method": ["pebble"], "teacher": ["noisy"], "rationality": ["-1", "1"]}, tmp_path)
+    assert [cell.path.parent.name for cell in found] == ["pebble-rationality-minus-1", "pebble-rationality-1"]
+
+
+def test_a_worker_is_told_where_a_label_file_is_wherever_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (cell,) = job_of(order((Cell(replace(small("pebble"), teacher="own.jsonl"), tmp_path / "run"),)))
+    assert cell.config.teacher == str(tmp_path / "own.jsonl")
 
 
 # Cells to workers, with a crew that does what the test says.

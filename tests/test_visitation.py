@@ -203,6 +203,14 @@ def test_the_object_is_marked_in_red_in_every_panel(tmp_path: Path):
         np.testing.assert_allclose(found.low + share * (found.high - found.low), [0.3, 0.9], atol=1e-6)
 
 
+def test_what_was_sampled_in_fewer_dimensions_is_not_drawn_with_the_others(tmp_path: Path):
+    run_of(tmp_path, config_of("mrn"), {10_000: cloud(HERE), 20_000: cloud(HERE)})
+    run_of(tmp_path, config_of("pebble"), {10_000: cloud(HERE[:2])})
+    section = visitation.section(runs_below(tmp_path))
+    told = rows_of(drawn(section, "door-lock-visitation"))
+    assert {row["arm"] for row in told} == {"mrn"} and {row["step"] for row in told} == {10_000, 20_000}
+
+
 @pytest.mark.parametrize("damage", [b"PK not an archive", b""])
 def test_a_broken_file_is_named_and_the_others_are_drawn(tmp_path: Path, damage: bytes):
     run_of(tmp_path, config_of("mrn"), {10_000: cloud(HERE)})

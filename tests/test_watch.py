@@ -237,6 +237,8 @@ def test_the_fingerprint_changes_when_a_file_of_a_run_does(tmp_path: Path):
         change()
         seen.add(fingerprint([tmp_path]))
         assert len(seen) == number
+    (tmp_path / "config.json").write_text('{"mine": 1}')  # of another program, above the runs
+    assert fingerprint([tmp_path]) in seen
     (tmp_path / "notes.txt").write_text("nothing to do with it")
     (run / "checkpoints").mkdir()
     assert fingerprint([tmp_path]) in seen

@@ -93,7 +93,7 @@ def standing(directory: Path) -> dict[str, Any] | None:
 def newest(
     directory: Path, template: Callable[[], Run], tell: Callable[[str], None]
 ) -> tuple[int, Run, dict[str, Any]] | None:
-    """The newest checkpoint that can be read as (step, run, progress); None if there is none at all.
+    """The newest checkpoint that can be read as (step, run, progress); None if there is none.
 
     A damaged one is named through ``tell``, and the one before is tried. What is newer than the one that is read
     is deleted: it will be written again, and must not count among those that are kept.

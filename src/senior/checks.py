@@ -109,6 +109,11 @@ def check(config: Config) -> Config:
         row.learns_reward or not people,
         f"Method {row.name} learns from the true reward and asks nothing, so --teacher human has no use.",
     )
+    of_release = row.select == "motion_distinction" and row.explore == "preference_guided" and row.outer == "bilevel"
+    _require(
+        of_release or config.compat == "none",
+        "--compat release is about m-senior: no other method is in its authors' public code.",
+    )
     until, random_steps = config.pretraining.until, config.pretraining.random_steps
     if not row.learns_reward:
         _require(until == 0, f"Method {row.name} learns from the true reward, so --pretraining.until must be 0.")
@@ -159,10 +164,6 @@ def check(config: Config) -> Config:
             "with --mix curiosity unless --pge.refresh-with-outer False.",
         )
     if config.compat == "release":
-        _require(
-            row.select == "motion_distinction" and row.explore == "preference_guided" and row.outer == "bilevel",
-            "--compat release is about m-senior: no other method is in its authors' public code.",
-        )
         for name, _, value in differences(release(config), config):
             raise BadInput(
                 f"With {name} {value} this is not what the public code does; leave --compat release out and give its "

@@ -138,6 +138,10 @@ def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < 1e300  # a comparison that no NaN and no infinity passes
 
 
+def _is_time(value: Any) -> bool:
+    return _is_number(value) and 0 <= value < 1e11  # in seconds; milliseconds since 1970 are more
+
+
 def _maybe(rule: _Rule) -> _Rule:
     return _Rule(lambda value: value is None or rule.holds(value), f"{rule.words} or null")
 
@@ -149,7 +153,6 @@ def _text(pattern: str, words: str) -> _Rule:
 
 _COUNT = _whole(0, 2**53)
 _BIT = _whole(0, 1)
-_NUMBER = _Rule(_is_number, "a finite number")
 _SHARE = _maybe(_Rule(lambda value: _is_number(value) and 0 <= value <= 1, "a number from 0 to 1"))
 _SIZE = _whole(1, 2**20)
 _HEADER = {
@@ -190,8 +193,8 @@ _OF_ANSWER = {
         _Rule(lambda value: type(value) is int and value in list(Preferred), "0 (first), 1 (second), -1 (equal)")
     ),
     "strength": _maybe(_text("slightly|clearly", '"slightly", "clearly"')),
-    "answered_at": _NUMBER,
-    "seconds": _maybe(_Rule(lambda value: _is_number(value) and value >= 0, "a finite number, 0 or more,")),
+    "answered_at": _Rule(_is_time, "a time in seconds since 1970"),
+    "seconds": _maybe(_Rule(_is_time, "a number of seconds, 0 or more,")),
     "replays": _maybe(_COUNT),
     "shown_left": _BIT,
     "clip_0": _maybe(_text(r"[0-9a-f]{64}", "a SHA-256")),

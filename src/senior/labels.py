@@ -48,7 +48,9 @@ def export_labels(run: Path, out: Path) -> int:
         segments = tuple(np.frombuffer(b"".join(column), "<f4").reshape(shape) for shape, column in columns)
         for pair in pairs:
             scores = json.loads(pair["scores"])
-            pair["scores"] = {name: score if math.isfinite(score) else None for name, score in scores.items()}
+            pair["scores"] = {
+                name: None if one is None or not math.isfinite(one) else one for name, one in scores.items()
+            }
             pair["answers"] = []
         by_number = {pair["id"]: pair for pair in pairs}
         for answer in answers:

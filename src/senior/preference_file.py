@@ -79,6 +79,8 @@ CREATE TABLE shape (steps INTEGER, observation INTEGER, action INTEGER);  -- of 
 """
 
 
+OPEN = "session > (SELECT COALESCE(MAX(session), -1) FROM pairs WHERE collected_step IS NOT NULL)"
+"""Of pairs: that their session is not trained on yet; sessions are collected in order."""
 PAIR = (
     "id",
     "session",

@@ -177,9 +177,10 @@ class Preferences:
         marks = ", ".join("?" * len(ids))
         rows = self._db.execute(f"SELECT scores, prediction FROM pairs WHERE id IN ({marks}) ORDER BY id", ids)
         scores, prediction = zip(*((json.loads(text), told) for text, told in rows), strict=True)
+        names = dict.fromkeys(name for one in scores for name in one)  # pairs of a file may be of several rules
         return Query(
             pairs,
-            {name: np.array([one[name] for one in scores]) for name in scores[0]},
+            {name: np.array([one.get(name) for one in scores], float) for name in names},
             None if None in prediction else np.array(prediction),
             reward_per_step,
         )
@@ -208,7 +209,8 @@ class Preferences:
             return waited_for or before[0] <= step
         chosen = asked_of(pairs, rules)
         latest = max((one.answered_at for pair in chosen for one in pair.said), default=0.0)
-        return all(pair.complete(rules) for pair in chosen) and time.time() - latest >= settle
+        settled = not 0 <= time.time() - latest < settle  # a clock may have been ahead
+        return all(pair.complete(rules) for pair in chosen) and settled
 
     def collect(self, session: int, step: int, rules: Rules) -> bool:
         """Take the answers to a session as they stand: from now on they are trained on, and cannot be undone.

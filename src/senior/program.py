@@ -84,6 +84,7 @@ def train_all(
     directory is not empty.
     """
     device = _check_runs(runs, workers, runs_per_device)
+    _check_page([config for config, _ in runs], page)
     watcher = watcher or Quiet()
     with Pools(workers, device, len(runs)) as pools:
         trainees: list[Trainee] = []
@@ -109,6 +110,7 @@ def continue_all(runs: Sequence[tuple[Config, Path]], watcher: Watcher) -> list[
     """`train_all`, but a run that is there goes on from its newest checkpoint, and a run that cannot be opened, or is
     another one, is told in its own result: the others go on. ``senior sweep`` stands on it."""
     device = _check_runs(runs, None, None)
+    _check_page([config for config, _ in runs], HERE)
     results: dict[Path, Result] = {}
     with Pools(None, device, len(runs)) as pools:
         waiting: list[Waiting] = []
@@ -152,13 +154,20 @@ def _check_runs(runs: Sequence[tuple[Config, Path]], workers: int | None, runs_p
     _check_machine(workers, runs_per_device)
     for config, _ in runs:
         check_offered(config)
-        if config.teacher == "human":
-            check_installed()
     if len({config.device for config, _ in runs}) > 1:
         raise BadInput("All runs of a program are on one device, so their --device must be the same.")
     if len({path.resolve() for _, path in runs}) < len(runs):
         raise BadInput("Every run needs a directory of its own.")
     return prepare_device(runs[0][0].device)
+
+
+def _check_page(configs: Sequence[Config], page: Address) -> None:
+    """`BadInput` where people are the teachers, and their pages cannot be served."""
+    asking = [config for config in configs if config.teacher == "human"]
+    if asking:
+        check_installed()
+    if len(asking) > 1 and page.port:
+        raise BadInput(f"--port {page.port} is for one page, and each of {len(asking)} runs has its own; leave it out.")
 
 
 def _trainee(config: Config, path: Path, device: str, pools: Pools) -> Trainee:
@@ -188,7 +197,7 @@ def resume(
     runs_per_device: int | None = None,
     page: Address = HERE,
 ) -> list[Result]:
-    """Continue an interrupted run, or every run under a directory that is not finished.
+    """Continue an interrupted run, or every run under a directory; those that are finished stay as they are.
 
     Runs of one shape that stand at the same step go on in one program. One that cannot go on is told, and the others
     do. ``workers``, ``runs_per_device``, ``page``: see `train_all`. Raises `BadInput` if there is no run, or the only
@@ -202,8 +211,10 @@ def resume(
         waiting: list[Waiting] = []
         results: list[Result] = []
         for directory in found:
+            trainee = None
             try:
                 config = load(directory / "config.json")
+                _check_page([config], page)
                 device = prepare_device(config.device)
                 if pools is None:
                     pools = stack.enter_context(Pools(workers, device, len(found)))
@@ -212,9 +223,15 @@ def resume(
                 trainee = Trainee(config, directory, learner, spec, pools.worker(learner))
                 waiting.append(_reopened(trainee, device, watcher))
             except BadInput as error:
+                _close([trainee] if trainee else [])
                 if len(found) == 1:
                     raise
                 results.append(unopened(directory, error, watcher))
+        try:
+            _check_page([run.trainee.config for run in waiting], page)
+        except BadInput:
+            _close([run.trainee for run in waiting])
+            raise
         return results + train_waiting(waiting, watcher, None, runs_per_device, len(found) == 1, page)
 
 

@@ -238,6 +238,8 @@ def told(path: Path) -> Iterator[None]:
 
 def make_room(file: Path) -> None:
     """Make the folder of a file that will be written when work is done; `BadInput` now if that cannot be."""
+    if file.is_dir():
+        raise BadInput(f"{file} is a directory; name a file.")
     with told(file.parent):
         file.parent.mkdir(parents=True, exist_ok=True)
 

@@ -16,7 +16,7 @@ from senior.learner import Purpose
 from senior.runs import Runs
 from senior.select import Context, probability_second
 from senior.trainee import Progress, Trainee
-from senior.types import Pairs, Preferred, Query
+from senior.types import Answers, Pairs, Preferred, Query
 
 Warn = Callable[[str, str | None], None]
 """Tells a warning of a kind, if there is one."""
@@ -118,7 +118,8 @@ def listen(trainee: Trainee) -> str | None:
                 f"The teacher {trainee.config.teacher} must answer pairs that it was asked, each once, by first (0), "
                 "second (1), equal (-1) or a skip (None)."
             )
-        preferences.answer(answers, trainee.config.teacher)
+        labels = [None if label is None else int(label) for label in answers.labels]  # they may be NumPy's
+        preferences.answer(Answers([int(number) for number in answers.ids], labels), trainee.config.teacher)
 
 
 def learn(trainee: Trainee, runs: Runs, i: int, step: int, warn: Warn) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 
 from senior import checkpoint, envs, labels, parts
 from senior.config import Config, made_by
+from senior.envs.drawing import NoVideo, prepare_opengl
 from senior.envs.episodes import EVALUATION, TRAINING, Episodes, Failure, Local, Step, episode_seed, restore
 from senior.envs.recording import Recording, repeats_itself
 from senior.envs.workers import Remote, Worker
@@ -52,7 +54,7 @@ class Progress:
     decided: list[int] = field(default_factory=list)  # of so many
     learned_returns: list[float] = field(default_factory=list)  # of the episodes since the last evaluation
     evaluations: list[list[float]] = field(default_factory=list)  # [success, mean learned return]
-    latest: dict[str, float] = field(default_factory=dict)  # numbers of rare events, for the next row of the log
+    latest: dict[str, float] = field(default_factory=dict)  # numbers of rare events, as last told
     lengths: dict[str, int] = field(default_factory=dict)  # bytes of the append-only files
     warned: list[str] = field(default_factory=list)
 
@@ -95,12 +97,14 @@ class Trainee:
         """Whether people can only see what happened if it is filmed when it does: see `senior.envs.recording`."""
         if self.config.teacher != "human" or self.config.env is None:
             return False
+        with suppress(NoVideo):  # it is told when an episode cannot be filmed
+            prepare_opengl()
         return self.directory.films.exists() or not repeats_itself(lambda: make_environment(self.config))
 
     def _film(self) -> Episodes:
         """The training environment, in this process, filmed."""
         local = Local(lambda: envs.make(**made_by(self.config), render=True), self.config.seed, TRAINING)
-        return Recording(local, self.directory.films, self.config.window)
+        return Recording(local, self.directory.films, self.config.window, self.config.queries.segment)
 
     @property
     def name(self) -> str:
@@ -169,8 +173,7 @@ class Trainee:
         self.progress.written = int(run.replay.count)  # the checkpoint was made before its own chunk was counted
         self.directory.truncate(self.progress.lengths, step)
         self._open_preferences()
-        self._relive(run)
-        return run
+        return self._relive(run)
 
     def _open_preferences(self) -> None:
         """Open the preference file with the labels that were learned from. Plain SAC asks nothing and has none.
@@ -180,8 +183,8 @@ class Trainee:
         if self.config.method.learns_reward:
             self.preferences.read(self.progress.collected)
 
-    def _relive(self, run: Run) -> None:
-        """Bring the environment to where the run stands, by the running episode's seed and actions.
+    def _relive(self, run: Run) -> Run:
+        """Bring the environment to where the run stands, by the running episode's seed and actions; the run.
 
         One that is filmed goes on with another episode instead. Any other that does not repeat itself is found out on
         the way. Where no episode is running, the latest one is lived through again for that.
@@ -191,7 +194,7 @@ class Trainee:
             progress.episode += bool(progress.elapsed)
             progress.elapsed, progress.episode_return, progress.episode_success = 0, 0.0, None
             self.reset(progress.episode)
-            return
+            return run._replace(learned_return=run.learned_return * 0)
         episode, rows = progress.episode, np.arange(count - progress.elapsed, count)
         latest = progress.recent[-1:]
         if not progress.elapsed and latest and latest[0][1] >= count - run.replay.capacity:
@@ -209,6 +212,7 @@ class Trainee:
             )
         if not progress.elapsed:
             self.reset(progress.episode)
+        return run
 
     def save(self, run: Run, step: int) -> None:
         """Write the policy and a checkpoint at the beginning of ``step``.

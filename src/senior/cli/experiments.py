@@ -114,7 +114,7 @@ class ReproduceOptions:
     paper: tyro.conf.Positional[Literal["senior"]]
     """Which paper: senior."""
     table: tuple[Literal["main", "feedback", "ablation", "quality"], ...] = ("main",)
-    """Its studies: main (Fig. 4, Table I), feedback (Fig. 5), ablation (Fig. 6), quality (Fig. 7).
+    """Its studies: main (Fig. 3, Table I), feedback (Fig. 4), ablation (Fig. 5), quality (Fig. 6).
     What several of them train is trained once."""
     scale: Literal["paper", "quick", "smoke"] = "paper"
     """paper: the paper's numbers. quick: the preset quick, for a CPU, for 100,000 steps. smoke: toy sizes."""
@@ -152,8 +152,14 @@ def reproduce(arguments: list[str]) -> int:
     code = DONE
     if options.train:
         code = run_cells(cells, out, options.jobs, options.ray)
-    if code != INTERRUPTED:
+    if code == INTERRUPTED:
+        return code
+    try:
         print(run.write(studies, options.scale, out))
+    except BadInput as error:
+        if code == DONE:
+            raise
+        print(f"senior: {error}", file=sys.stderr)  # where cells failed the code is theirs
     return code
 
 

@@ -29,14 +29,11 @@ def repeats_itself(make: Callable[[], tuple[gymnasium.Env[Any, Any], EnvSpec]]) 
     ``make``: as for `Local`; two environments take `STEPS` random steps each, one of them after a few of another
     episode. Raises `BadInput` where one cannot be made or breaks.
     """
-    fresh, used = (Local(make, 0, AFTERWARDS) for _ in range(2))
-    actions = np.random.default_rng(0).uniform(-1, 1, (STEPS, fresh.spec.action_size)).astype(np.float32)
-    try:
+    with contextlib.ExitStack() as stack:
+        fresh, used = (stack.enter_context(contextlib.closing(Local(make, 0, AFTERWARDS))) for _ in range(2))
+        actions = np.random.default_rng(0).uniform(-1, 1, (STEPS, fresh.spec.action_size)).astype(np.float32)
         _lived(used, 1, actions[: STEPS // 10])
         return _lived(fresh, 0, actions) == _lived(used, 0, actions)
-    finally:
-        fresh.close()
-        used.close()
 
 
 def _lived(place: Local, episode: int, actions: np.ndarray) -> list[object]:
@@ -72,14 +69,17 @@ class Recording:
     half of one; an episode that is lived through once more is filmed once more, and takes the place of the first.
     The run that goes on after a kill must not live through complete episodes again, as it would elsewhere.
 
-    MuJoCo draws only if `senior.envs.drawing.prepare_opengl` was called before it was imported.
+    MuJoCo draws only if `senior.envs.drawing.prepare_opengl` was called before it was imported, as a run does that must
+    be filmed.
     """
 
-    def __init__(self, local: Local, folder: Path, keep: int) -> None:
-        """``local``: made by ``make(..., render=True)``. ``keep``: of so many latest episodes the films are kept."""
+    def __init__(self, local: Local, folder: Path, keep: int, segment: int) -> None:
+        """``local``: made by ``make(..., render=True)``. ``keep``: of so many latest episodes the films are kept, those
+        not longer than ``segment`` steps left out: no pair is cut from them."""
         self.local = local
         self.folder = folder
         self.keep = keep
+        self.segment = segment
         self.observation = local.observation
         self.notes = local.notes
         self._camera: Camera | None = None
@@ -93,6 +93,7 @@ class Recording:
         self.folder.mkdir(parents=True, exist_ok=True)
         for unfinished in self.folder.glob("*.part"):
             unfinished.unlink()
+        self._drop([number for number in self._kept() if number >= episode])  # of a life that did not last
         if afresh:
             self._put_away()
         return self._begun(self.local.begin(episode, afresh))
@@ -146,7 +147,8 @@ class Recording:
 
     def _finish(self) -> None:
         """Put the running film in its place, and throw away those that are older than the latest to be kept."""
-        if self._film is None:
+        if self._film is None or len(self._observations) <= self.segment:
+            self._discard()
             return
         observations = observations_of(self._film.out)
         try:
@@ -158,10 +160,16 @@ class Recording:
         except Exception as error:
             self._tell(error)
         self._discard()
-        for film in self.folder.glob("episode-*.mp4"):
-            if int(film.stem.removeprefix("episode-")) <= self.local.episode - 1 - self.keep:
-                film.unlink()
-                observations_of(film).unlink(missing_ok=True)
+        self._drop(self._kept()[: -self.keep])
+
+    def _kept(self) -> list[int]:
+        """Numbers of the episodes of which there are films, in order."""
+        return sorted(int(film.stem.removeprefix("episode-")) for film in self.folder.glob("episode-*.mp4"))
+
+    def _drop(self, episodes: list[int]) -> None:
+        for film in (film_of(self.folder, episode) for episode in episodes):
+            film.unlink()
+            observations_of(film).unlink(missing_ok=True)
 
     def _discard(self) -> None:
         """Forget the running film, if there is one that was not finished."""

@@ -105,7 +105,7 @@ def draw(request: Request, out: Path) -> None:
     fps = own_fps(env)
     stride = max(1, round(fps / MOST_FPS))
     try:
-        with Film(out, Fraction(fps // stride)) as film:
+        with Film(out, Fraction(fps, stride)) as film:
             for frame in _frames(env, request, stride):
                 film.add(frame)
     finally:

@@ -30,7 +30,7 @@ from senior.config import load, made_by
 from senior.envs.drawing import KEYFRAMES, Film, NoVideo
 from senior.envs.recording import film_of
 from senior.label.scenes import Segment, Stage, Unlike, film_fps, filmed
-from senior.preference_file import connect, has_tables, transaction
+from senior.preference_file import OPEN, connect, has_tables, transaction
 from senior.types import BadInput
 
 try:
@@ -81,7 +81,7 @@ class Store:
         for name in found.keys() - kept:
             found[name].unlink()
         lost = [(name.removesuffix(".mp4"),) for name in kept - found.keys()]
-        still_asked = "pair IN (SELECT id FROM pairs WHERE collected_step IS NULL)"
+        still_asked = f"pair IN (SELECT id FROM pairs WHERE {OPEN})"
         with transaction(self.db):
             self.db.executemany(f"DELETE FROM clips WHERE name = ? AND {still_asked}", lost)
             self.db.execute(f"DELETE FROM clips WHERE failure IS NOT NULL AND {still_asked}")
@@ -99,11 +99,11 @@ class Store:
         stands, then the earlier one.
         """
         row = self.db.execute(
-            """
+            f"""
             WITH segments AS (
                 SELECT id AS pair, side, reserve,
                        iif(side, episode_1, episode_0) AS episode, iif(side, start_1, start_0) AS start
-                FROM pairs JOIN (SELECT 0 AS side UNION SELECT 1) WHERE collected_step IS NULL
+                FROM pairs JOIN (SELECT 0 AS side UNION SELECT 1) WHERE {OPEN}
                 AND (SELECT COUNT(*) FROM answers WHERE answers.pair = pairs.id AND withdrawn IS NULL) < ?
             ), chosen AS (
                 SELECT * FROM segments

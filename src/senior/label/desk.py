@@ -15,7 +15,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Literal, NamedTuple
 
-from senior.preference_file import Asked, Foretold, Rules, asked_of, connect, foretold, pairs_of, transaction
+from senior.preference_file import OPEN, Asked, Foretold, Rules, asked_of, connect, foretold, pairs_of, transaction
 from senior.types import Preferred
 
 LEASE_SECONDS = 120.0
@@ -25,8 +25,6 @@ AHEAD = 3
 PAUSE_SECONDS = 120.0
 """Between answers, what is longer is no work and does not count in the rate."""
 
-_OPEN = "session > (SELECT COALESCE(MAX(session), -1) FROM pairs WHERE collected_step IS NOT NULL)"
-"""Sessions that are not trained on yet; they are collected in order."""
 
 Side = Literal["left", "right", "equal", "skip"]
 
@@ -180,11 +178,11 @@ class Desk:
 
     def _is_open(self, number: int) -> bool:
         """Whether a pair is not trained on yet."""
-        return self._db.execute(f"SELECT 1 FROM pairs WHERE id = ? AND {_OPEN}", (number,)).fetchone() is not None
+        return self._db.execute(f"SELECT 1 FROM pairs WHERE id = ? AND {OPEN}", (number,)).fetchone() is not None
 
     def _asked(self, number: int) -> Asked | Outcome:
         """The pair, if it is being asked."""
-        row = self._db.execute(f"SELECT session, {_OPEN} FROM pairs WHERE id = ?", (number,)).fetchone()
+        row = self._db.execute(f"SELECT session, {OPEN} FROM pairs WHERE id = ?", (number,)).fetchone()
         if row is None:
             return Outcome(refused=f"There is no pair {number}.")
         session, is_open = row
@@ -233,7 +231,7 @@ class Desk:
 
     def _open(self) -> list[Asked]:
         """The pairs that are asked and not trained on."""
-        return asked_of(pairs_of(self._db, _OPEN), self.rules)
+        return asked_of(pairs_of(self._db, OPEN), self.rules)
 
     def _shown(self, pair: Asked, asked: Sequence[Asked]) -> dict[str, Any] | None:
         """A pair, of those that are ``asked``, as a page shows it; None if its clips are not drawn yet."""
@@ -264,7 +262,7 @@ class Desk:
         with self._lock, transaction(self._db):  # the trainer may collect meanwhile
             pairs = self._open()
             done = self._done(pairs)
-            (before,) = self._db.execute(f"SELECT COUNT(*) FROM pairs WHERE NOT reserve AND NOT ({_OPEN})").fetchone()
+            (before,) = self._db.execute(f"SELECT COUNT(*) FROM pairs WHERE NOT reserve AND NOT ({OPEN})").fetchone()
             session = None
             if pairs:
                 first = [pair for pair in pairs if pair.session == pairs[0].session]
@@ -272,7 +270,7 @@ class Desk:
                 session = {"number": pairs[0].session + 1, "done": self._done(first), "size": size}
             (ready, failure) = self._db.execute(
                 "SELECT COUNT(*), MAX(failure) FROM (SELECT pair, MAX(failure) AS failure FROM clips "
-                f"WHERE pair IN (SELECT id FROM pairs WHERE NOT reserve AND {_OPEN}) GROUP BY pair HAVING COUNT(*) = 2)"
+                f"WHERE pair IN (SELECT id FROM pairs WHERE NOT reserve AND {OPEN}) GROUP BY pair HAVING COUNT(*) = 2)"
             ).fetchone()
             wanted = sum(not pair.reserve for pair in pairs)
             return {

@@ -28,6 +28,7 @@ from senior.label.guard import MOST_BYTES, Access, is_loopback
 from senior.label.serving import BAD_INPUT, SERVED, Address, Served
 from senior.label.standing import Standing
 from senior.preference_file import has_tables
+from senior.rundir import told
 from senior.types import BadInput
 
 FIRST_PORT = 8642
@@ -43,7 +44,7 @@ def standing_of(run: Path, config: Config) -> Standing:
 def access_to(address: Address, port: int, token: str) -> Access:
     """Who is let in at an address."""
     local = is_loopback(address.host)
-    names = {"127.0.0.1", "::1"} if local else {address.host.lower(), socket.gethostname().lower()}
+    names = {address.host.lower(), *(("127.0.0.1", "::1") if local else (socket.gethostname().lower(),))}
     allowed = {name.lower() for name in address.allowed_hosts}
     return Access(token, f"senior-{port}", frozenset({"localhost", *names, *allowed}), anywhere=not local)
 
@@ -93,8 +94,9 @@ def serve(run: Path, address: Address, owner: str) -> Served:
         raise BadInput("Only letters from A to Z, digits and . _ ~ - can stand in a token.")
     if address.token == "" and not is_loopback(address.host):
         raise BadInput(f"Without a token the page can only be served to this machine, not on {address.host}.")
-    (folder / "clips").mkdir(parents=True, exist_ok=True)
-    lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
+    with told(folder):
+        (folder / "clips").mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -111,13 +113,17 @@ def _serve_alone(run: Path, config: Config, address: Address, owner: str) -> Ser
     folder = run / "label"
     before = Served.find(run)
     (folder / "server.json").unlink(missing_ok=True)  # of a server that is gone
-    token = _token(folder, address.token)
-    if owner == "user" and not has_tables(run / "preferences.sqlite"):
-        print("The run has not begun; the page is served when it does.", file=sys.stderr)
-    while not has_tables(run / "preferences.sqlite"):
-        time.sleep(0.2)
-    listening = _bind(address, before.port if before else None)
-    port = listening.getsockname()[1]
+    try:
+        if owner == "user" and not has_tables(run / "preferences.sqlite"):
+            print("The run has not begun; the page is served when it does.", file=sys.stderr)
+        while not has_tables(run / "preferences.sqlite"):
+            time.sleep(0.2)
+        listening = _bind(address, before.port if before else None)
+    except BaseException:  # nothing is served, and where it was is the run's own
+        if before is not None:
+            before.write(run)
+        raise
+    token, port = _token(folder, address.token), listening.getsockname()[1]
     served = Served(_shown_host(address.host), port, token, os.getpid(), owner)
     served.write(run)
     print(served.url, flush=True)
@@ -144,10 +150,10 @@ def _shown_host(host: str) -> str:
 
 def main(arguments: list[str]) -> int:
     """The process: its arguments are the run, and an `Address` and the owner as JSON."""
-    run, told = Path(arguments[0]), json.loads(arguments[1])
-    owner = told.pop("owner")
+    run, wanted = Path(arguments[0]), json.loads(arguments[1])
+    owner = wanted.pop("owner")
     try:
-        served = serve(run, Address(**{**told, "allowed_hosts": tuple(told["allowed_hosts"])}), owner)
+        served = serve(run, Address(**{**wanted, "allowed_hosts": tuple(wanted["allowed_hosts"])}), owner)
     except BadInput as error:
         print(error, file=sys.stderr)
         return BAD_INPUT

@@ -108,7 +108,12 @@ class Serving:
 
     def __exit__(self, *_: object) -> None:
         """Give the pages a moment to hear how it ended, and end the server unless the user started it."""
-        self._over.wait(1.5)
+        try:
+            self._over.wait(1.5)
+        finally:
+            self._end()
+
+    def _end(self) -> None:
         self._over.set()
         served = Served.find(self.run)
         if self._process is not None and self._process.poll() is None:

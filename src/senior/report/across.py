@@ -19,7 +19,7 @@ from senior.report.cells import tells_success
 from senior.report.looks import Look, in_order
 from senior.report.looks import looks as looks_of
 from senior.report.page import Drawing
-from senior.report.records import Run
+from senior.report.records import Fingerprint, Run
 from senior.report.statistics import Intervals, by_labels, interquartile_means, mean_and_deviation
 from senior.report.tables import Cell
 
@@ -29,7 +29,11 @@ PAIRS = 50
 """Latest decided pairs over which prospective accuracy is taken."""
 STEPS = "environment steps"
 
+WITH_BUDGET = ("--budget", "--per-session")
+"""Options that differ between the budgets of one line."""
+
 _BUDGET = re.compile(r" --budget \d+")
+_NUMBER = re.compile(r" \[\d+\]$")
 
 
 def together(curves: Sequence[Curve]) -> Curve:
@@ -117,12 +121,18 @@ def label_curves(task: str, arms: Runs, looks: Mapping[str, Look]) -> Drawing | 
 @styled
 def budget_curves(task: str, arms: Runs) -> Drawing | None:
     """Scores at the end against the budget, for methods that were run with several; None if there are none."""
-    found: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    found: dict[tuple[str, Fingerprint], dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for label, runs in arms.items():
         for run in runs:
             if run.config is not None and run.asks and run.finished:
-                found[_BUDGET.sub("", label)][run.config.queries.budget].append(float(run.score[-1]))
-    several = {label: found[label] for label in in_order(found) if len(found[label]) > 1}
+                else_ = tuple(entry for entry in run.arm.fingerprint if entry[0] not in WITH_BUDGET)
+                found[_BUDGET.sub("", label), else_][run.config.queries.budget].append(float(run.score[-1]))
+    lines: dict[str, dict[int, list[float]]] = {}
+    for (name, _), by_budget in found.items():
+        if len(by_budget) > 1:
+            again = sum(_NUMBER.sub("", label) == name for label in lines)
+            lines[f"{name} [{again + 1}]" if again else name] = by_budget
+    several = {label: lines[label] for label in in_order(lines)}
     if not several:
         return None
     rows: list[Sequence[Cell]] = [("task", "arm", "budget", "runs", "mean", "deviation")]
@@ -135,7 +145,10 @@ def budget_curves(task: str, arms: Runs) -> Drawing | None:
         bands[label] = Band(np.array(budgets), mean, mean - deviation, mean + deviation)
     most = max(band.x[-1] for band in bands.values())
     frame = Frame(task, "budget", f"{measure(arms)} at the end", 1.02 * most, tells_success(arms))
-    caption = f"{task}: at the end of runs with several budgets; mean and standard deviation over seeds."
+    caption = (
+        f"{task}: at the end of runs with several budgets; mean and standard deviation over seeds. Arms of one name "
+        "that differ in more than the budget are lines of their own, with a number."
+    )
     return Drawing(f"{task}-budgets", caption, banded(bands, looks_of(several), frame), rows)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
 from typing import NamedTuple
 
@@ -88,7 +89,8 @@ def _arrays(
         position.append(seen[..., where].copy())  # the rest is let go of
         objects.append(seen[:, 0, OBJECT].copy())
         returns.append(np.frombuffer(reward, "<f4").reshape(shape[:2]).sum(axis=1, dtype=float))
-        scores.append({str(name): float(value) for name, value in json.loads(score).items()})
+        told = json.loads(score).items()
+        scores.append({str(name): math.nan if value is None else float(value) for name, value in told})
         second.append(np.nan if label is None else float(label))
         collected.append(step is not None)
     if not numbers:

@@ -66,6 +66,7 @@ def section(runs: Sequence[Run]) -> Section | None:
         plane = plane_of(arms, [next(iter(read.values())) for read in told.values()], left_out)
         if plane:
             told = {label: read for label, read in told.items() if _size(read) == plane.size}
+        if plane and told:
             drawings.append(_draw(task, told, plane, look))
             tables.append(_table(task, told, plane))
     if not drawings:

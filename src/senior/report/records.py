@@ -311,9 +311,11 @@ def _episodes(path: Path) -> Episodes:
 
 
 def _seconds(path: Path) -> float:
-    """The clock begins anew with every process that goes on with the run."""
-    clock = columns(path, ("step", "seconds"))["seconds"]
+    """The clock begins anew with every process that goes on with the run, and then does not fit the rate."""
+    told = columns(path, ("step", "seconds"), ("steps_per_second",))
+    clock = told["seconds"]
     if not len(clock) or not np.isfinite(clock).all():
         raise Unusable(f"{path.name} tells no time")
-    gone = np.diff(clock, prepend=0.0)
-    return float(np.where(gone >= 0, gone, clock).sum())
+    gone, expected = np.diff(clock, prepend=0.0), np.diff(told["step"], prepend=0.0) / told["steps_per_second"]
+    went_on = np.where(np.isnan(expected), gone >= 0, np.isclose(gone, expected, rtol=1e-3))
+    return float(np.where(went_on, gone, clock).sum())

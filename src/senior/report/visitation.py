@@ -75,7 +75,12 @@ def visits_of(task: str, arms: Arms, plane: Plane, look: Mapping[str, Look], lef
 
     A step can be shown if every arm that has snapshots has one of it; the seeds that have it are pooled.
     """
-    held = {label: [usable(visited, run, left_out) or {} for run in runs] for label, runs in arms.items()}
+
+    def held_by(run: Run) -> dict[int, np.ndarray]:
+        snapshots = usable(visited, run, left_out) or {}
+        return {step: positions for step, positions in snapshots.items() if positions.shape[1] == plane.size}
+
+    held = {label: [held_by(run) for run in runs] for label, runs in arms.items()}
     steps_of = {label: {step for snapshots in own for step in snapshots} for label, own in held.items()}
     steps_of = {label: steps for label, steps in steps_of.items() if steps}
     steps = evenly(sorted(set.intersection(*steps_of.values())), COLUMNS) if steps_of else []

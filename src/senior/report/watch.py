@@ -36,6 +36,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from senior.label.guard import SEALED, is_loopback
+from senior.rundir import is_run
 from senior.types import BadInput
 
 LOOK_SECONDS = 2.0
@@ -177,13 +178,13 @@ def fingerprint(places: Sequence[Path]) -> tuple[tuple[str, int, int], ...]:
     """What changes when a file of a run at or below the places does: names, times and sizes."""
     found, seen = [], set()
     for place in places:
-        for folder, folders, files in os.walk(place, followlinks=True):
+        for folder, folders, _ in os.walk(place, followlinks=True):
             own = os.path.realpath(folder)
             if own in seen:  # a link may lead back
                 folders.clear()
                 continue
             seen.add(own)
-            if "config.json" not in files:
+            if not is_run(Path(folder)):
                 folders.sort()
                 continue
             folders.clear()  # no run lies within another

@@ -24,8 +24,7 @@ def studies_of(tables: Sequence[Table], tasks: tuple[str, ...] | None) -> dict[T
     for task in tasks or ():
         if task not in known:
             raise BadInput(f"The paper has no {task} in {' or '.join(tables)}; its tasks there are {', '.join(known)}.")
-    found: dict[Table, Study] = {table: chosen(table, tasks) for table in tables}
-    return {table: study for table, study in found.items() if study.tasks}
+    return {table: chosen(table, tasks) for table in tables}
 
 
 def folder(out: Path, arm: Arm, task: str, scale: Scale) -> Path:
@@ -73,10 +72,10 @@ def runs_by_arm(
                         alike.setdefault(run.arm.fingerprint, []).append(run)
                 most = max(alike.values(), key=len, default=[])
                 for run in (run for own in alike.values() if own is not most for run in own):
-                    refused.append(LeftOut(run.path, "a protocol that most runs beside it do not have"))
+                    refused.append(LeftOut(run.path, "another protocol than the runs beside it that count"))
                 if most:
                     counted[arm.name, task] = most
-    return counted, [f"Not judged: {line}." for line in grouped(refused)]
+    return counted, [f"Not judged: {line}." for line in grouped(list(dict.fromkeys(refused)))]
 
 
 def _comparable(config: Config) -> Config:

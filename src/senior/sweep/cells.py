@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -101,7 +101,12 @@ def saved_step(path: Path) -> int:
 
 def order(job: Job) -> str:
     """A job as a line of JSON, for a worker."""
-    return json.dumps([{"path": str(cell.path.resolve()), "config": to_json(cell.config)} for cell in job])
+    return json.dumps([{"path": str(cell.path.resolve()), "config": to_json(_anywhere(cell.config))} for cell in job])
+
+
+def _anywhere(config: Config) -> Config:
+    """With the path of a label file absolute: a worker may stand in another directory."""
+    return replace(config, teacher=parts.resolved(config).teacher)
 
 
 def job_of(order: str) -> Job:

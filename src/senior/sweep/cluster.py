@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from senior.extras import require
+from senior.rundir import told
 from senior.sweep.cells import Done, Job, Outcome, job_of, order, outcomes_of, report
 from senior.sweep.cores import take_cores
-from senior.sweep.scheduler import LEAVE_SECONDS
+from senior.sweep.scheduler import LEAVE_SECONDS, RETRIES
 from senior.sweep.worker import Watch, train
 from senior.types import BadInput
 
@@ -72,17 +73,19 @@ class RayCrew:
         self._ray = _connect(address)
         self._wanted, self._say = device, say
         self._marker = out.resolve() / f"sweep-{uuid.uuid4().hex}"
-        self._marker.touch()
+        with told(out):
+            self._marker.touch()
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         with_gpu = [node for node in nodes if node.get("GPU", 0) >= 1 and device != "cpu"]
         gpus = int(sum(node["GPU"] for node in with_gpu))
         self.device = "gpu" if gpus else "cpu"
-        self.size = jobs or gpus or int(sum(node.get("CPU", 0) for node in nodes))
+        self.size = jobs or gpus or max(1, int(sum(node.get("CPU", 0) for node in nodes)))
         self._cpus = max(1, min((int(node.get("CPU", 1) // node["GPU"]) for node in with_gpu), default=1))
         self._ready: list[Any] = []
         self._placing: dict[Any, Any] = {}
         self._jobs: dict[Any, tuple[Any, Job]] = {}
         self._asked, self._told = time.monotonic(), False
+        self._fallen = 0  # actors in a row that were lost before they could begin
         for _ in range(self.size):
             self._hire()
 
@@ -129,6 +132,9 @@ class RayCrew:
         """A new actor, which may have to wait for its place."""
         resources = {"num_cpus": self._cpus, "num_gpus": int(self.device == "gpu")}
         hand = self._ray.remote(Hand).options(max_concurrency=2, **resources).remote(self._cpus, str(self._marker))
+        self._begin(hand)
+
+    def _begin(self, hand: Any) -> None:
         self._placing[hand.begin.remote(self._wanted)] = hand
 
     def _welcome(self, placed: Any) -> None:
@@ -136,9 +142,15 @@ class RayCrew:
         try:
             refused = self._ray.get(placed)
         except self._ray.exceptions.RayError as error:
+            lost = isinstance(error, self._ray.exceptions.RayActorError)
+            if lost and self._fallen < self.size + RETRIES:
+                self._fallen += 1
+                self._hire()
+                return
             refused = f"A worker on the Ray cluster cannot begin: {_first_line(error)}"
         if refused:
             raise BadInput(refused)
+        self._fallen = 0
         self._ready.append(hand)
 
     def _take(self, reference: Any) -> Done:
@@ -147,6 +159,9 @@ class RayCrew:
             done = Done(job, outcomes_of(self._ray.get(reference)))
         except self._ray.exceptions.RayError as error:
             self._hire()
+            for idle in self._ready:  # they may be lost with it
+                self._begin(idle)
+            self._ready.clear()
             return Done(job, (), f"its worker was lost ({type(error).__name__}: {_first_line(error)})")
         self._ready.append(hand)
         return done

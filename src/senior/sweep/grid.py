@@ -63,7 +63,7 @@ def read(file: Path) -> Grid:
         if any(isinstance(one, (list, dict)) for one in values):
             raise BadInput(f"{file}: {name} must be a value or a list of values.")
         if name in FLAGS:
-            if len(values) > 1:
+            if len(values) != 1 or not isinstance(values[0], bool):
                 raise BadInput(f"{file}: {name} must be true or false.")
             grid[name if values[0] else f"no-{name}"] = []
         else:
@@ -111,8 +111,14 @@ def cells_of(grid: Grid, out: Path) -> list[Cell]:
         chosen = dict(zip(axes, values, strict=True))
         arm = chosen.pop("arm")
         config = configured(arm, chosen)
-        cells.append(Cell(config, place(out, config, "-".join([arm, *(f"{name}-{chosen[name]}" for name in varied)]))))
+        name = "-".join([arm, *(f"{name}-{_word(chosen[name])}" for name in varied)])
+        cells.append(Cell(config, place(out, config, name)))
     return cells
+
+
+def _word(value: str) -> str:
+    """A value in the name of a directory, where a dash says nothing."""
+    return f"minus-{value[1:]}" if value.startswith("-") else value
 
 
 def configured(arm: str, options: Mapping[str, str]) -> Config:

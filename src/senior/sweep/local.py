@@ -11,7 +11,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from senior.rundir import threads
+from senior.rundir import threads, told
 from senior.sweep.cells import Done, Job, order, outcomes_of
 from senior.sweep.scheduler import LEAVE_SECONDS
 from senior.types import BadInput
@@ -35,6 +35,8 @@ class LocalCrew:
 
         Raises `BadInput` if there is no such device.
         """
+        with told(logs):
+            logs.mkdir(parents=True, exist_ok=True)
         self.device = find_device(device)
         if self.device == "gpu" and (jobs or 1) > 1:
             raise BadInput(f"--jobs {jobs}: a GPU has one worker, which trains as many runs at a time as it holds.")
@@ -42,7 +44,6 @@ class LocalCrew:
         self._threads = max(1, threads() // self.size)
         self._logs = logs
         self._workers: list[_Worker] = []
-        logs.mkdir(parents=True, exist_ok=True)
 
     @property
     def idle(self) -> int:
@@ -51,7 +52,12 @@ class LocalCrew:
 
     def give(self, job: Job) -> None:
         """Have a job done."""
-        worker = next((worker for worker in self._workers if worker.job is None), None) or self._start()
+        idle = [worker for worker in self._workers if worker.job is None]
+        for worker in [worker for worker in idle if worker.process.poll() is not None]:
+            idle.remove(worker)
+            self._workers.remove(worker)
+            self._bury(worker)
+        worker = idle[0] if idle else self._start()
         worker.job = job
         with contextlib.suppress(BrokenPipeError):  # it died idle; `wait` finds out
             os.write(worker.orders, f"{order(job)}\n".encode())
@@ -148,7 +154,7 @@ def find_device(device: str) -> str:
         return device
     program = "import sys\nfrom senior.runs import prepare_device\nfrom senior.types import BadInput\n"
     program += f"try:\n    print(prepare_device({device!r}))\nexcept BadInput as error:\n    sys.exit(str(error))\n"
-    asked = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    asked = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, start_new_session=True)
     if asked.returncode:
         raise BadInput((asked.stderr.strip().splitlines() or ["The device cannot be found out."])[-1])
     return asked.stdout.strip()
