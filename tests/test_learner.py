@@ -571,7 +571,7 @@ def test_numbers_of_numpy_are_answers_like_others(tmp_path: Path):
     assert ours.finished and theirs.finished
 
     def said(path: Path) -> list[list[object]]:
-        return [[answer[1] for answer in row[-1]] for row in preferences_dump(path)]
+        return [[answer[2] for answer in row[-1]] for row in preferences_dump(path)]  # number, who, what
 
     assert said(theirs.path) == said(ours.path) and {1} < {x for row in said(ours.path) for x in row}
 
