@@ -600,7 +600,7 @@ def test_films_are_kept_of_the_latest_episodes_that_pairs_are_cut_from(tmp_path:
     for step in range(3 * HORIZON):
         acted(recording, place.episode, step)
     assert {path.name for path in tmp_path.glob("*.mp4")} == {"episode-4.mp4", "episode-5.mp4"}
-    recording.begin(5)  # goes on from a checkpoint before that one
+    recording.forget(5)  # goes on from a checkpoint before that one
     assert {path.name for path in tmp_path.glob("*.mp4")} == {"episode-4.mp4"}
     assert {path.name for path in tmp_path.glob("*.npy")} == {"episode-4.npy"}
     recording.close()

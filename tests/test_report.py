@@ -749,7 +749,7 @@ def test_budgets_stand_beside_each_other(tmp_path: Path):
 
 
 def test_budgets_of_two_protocols_are_two_lines(tmp_path: Path):
-    for name, method, budgets in (("paper", "m-senior", (500, 1000)), ("quick", "m-senior", (250, 500))):
+    for name, method, budgets in (("paper", "m-senior", (150, 500, 1000)), ("quick", "m-senior", (250, 500))):
         for budget in budgets:
             own = with_budget(preset(name, "door-open", method), budget)
             success = [budget / 2000] * 3 + [budget / 1000]
@@ -758,7 +758,7 @@ def test_budgets_of_two_protocols_are_two_lines(tmp_path: Path):
     drawing = across.budget_curves("door-open", arms)
     assert drawing is not None
     told = {row[1:3]: row[4] for row in drawing.rows[1:]}
-    assert {budget for _, budget in told} == {250, 500, 1000} and len(told) == 4
+    assert sorted(budget for _, budget in told) == [150, 250, 500, 500, 1000]  # only one of them has two protocols
     assert all(mean == budget / 1000 for (_, budget), mean in told.items())
     assert len({label for label, _ in told}) == 2
 

@@ -13,8 +13,8 @@ import pytest
 from scipy import stats
 
 from senior.checks import check
-from senior.cli import main
-from senior.cli.shared import BAD_INPUT, DONE
+from senior.cli import experiments, main
+from senior.cli.shared import BAD_INPUT, DONE, FAILED
 from senior.report.records import Run
 from senior.report.results import read
 from senior.reproduce import run as reproduce
@@ -258,6 +258,17 @@ def test_runs_that_do_not_count_are_told_once_however_many_studies_have_them(tmp
     path = write_run(reproduce.folder(tmp_path, arm, "door-lock", "quick") / "seed-5", config, files=("eval.csv",))
     _, refused = reproduce.runs_by_arm(studies.values(), "quick", tmp_path, read([tmp_path]).runs)
     assert refused == [f"Not judged: {path}: no run of its arm at the scale quick."]
+
+
+def test_where_cells_failed_the_code_says_so_though_there_is_no_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(experiments, "run_cells", lambda *_: FAILED)
+    command = ["reproduce", "senior", "--scale", "smoke", "--out", str(tmp_path)]
+    assert main(command) == FAILED
+    assert "There is no run that can be reported" in capsys.readouterr().err
+    monkeypatch.setattr(experiments, "run_cells", lambda *_: DONE)
+    assert main(command) == BAD_INPUT
 
 
 def test_what_the_paper_has_not_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -459,6 +459,24 @@ def test_a_dead_worker_is_found_though_something_that_it_started_lives_on(tmp_pa
     crew.close()
 
 
+def test_a_worker_that_died_idle_costs_no_cell_a_try(tmp_path: Path):
+    crew = LocalCrew("cpu", 1, tmp_path / "logs")
+
+    def outcome(name: str) -> tuple[Outcome, ...]:
+        crew.give((Cell(short(device="cpu"), tmp_path / name),))
+        until = time.monotonic() + 300
+        while not (done := crew.wait(0.5)):
+            assert time.monotonic() < until
+        return done[0].outcomes
+
+    assert outcome("first") == (Outcome(True, None),)
+    dead = json.loads((tmp_path / "first" / "status.json").read_text())["process"]
+    os.kill(dead, signal.SIGKILL)
+    os.waitid(os.P_PID, dead, os.WEXITED | os.WNOWAIT)
+    assert outcome("second") == (Outcome(True, None),)
+    crew.close()
+
+
 class Forking(Point):
     """A point with a helper, which outlives it for two minutes."""
 

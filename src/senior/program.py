@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 
 from senior import parts, rundir
 from senior.config import Config, load
+from senior.envs.drawing import NoVideo, prepare_opengl
 from senior.fit import check_fit, check_offered, spec_of
 from senior.label.serving import Address, check_installed
 from senior.learner import Learner
@@ -84,7 +85,7 @@ def train_all(
     directory is not empty.
     """
     device = _check_runs(runs, workers, runs_per_device)
-    _check_page([config for config, _ in runs], page)
+    _ready_for_people([config for config, _ in runs], page)
     watcher = watcher or Quiet()
     with Pools(workers, device, len(runs)) as pools:
         trainees: list[Trainee] = []
@@ -110,7 +111,7 @@ def continue_all(runs: Sequence[tuple[Config, Path]], watcher: Watcher) -> list[
     """`train_all`, but a run that is there goes on from its newest checkpoint, and a run that cannot be opened, or is
     another one, is told in its own result: the others go on. ``senior sweep`` stands on it."""
     device = _check_runs(runs, None, None)
-    _check_page([config for config, _ in runs], HERE)
+    _ready_for_people([config for config, _ in runs], HERE)
     results: dict[Path, Result] = {}
     with Pools(None, device, len(runs)) as pools:
         waiting: list[Waiting] = []
@@ -161,11 +162,14 @@ def _check_runs(runs: Sequence[tuple[Config, Path]], workers: int | None, runs_p
     return prepare_device(runs[0][0].device)
 
 
-def _check_page(configs: Sequence[Config], page: Address) -> None:
-    """`BadInput` where people are the teachers, and their pages cannot be served."""
+def _ready_for_people(configs: Sequence[Config], page: Address) -> None:
+    """Before any environment is made: `BadInput` where people are the teachers, and their pages cannot be served."""
     asking = [config for config in configs if config.teacher == "human"]
     if asking:
         check_installed()
+    if any(config.env for config in asking):  # they may have to be filmed
+        with suppress(NoVideo):  # which is told when an episode cannot be
+            prepare_opengl()
     if len(asking) > 1 and page.port:
         raise BadInput(f"--port {page.port} is for one page, and each of {len(asking)} runs has its own; leave it out.")
 
@@ -214,7 +218,7 @@ def resume(
             trainee = None
             try:
                 config = load(directory / "config.json")
-                _check_page([config], page)
+                _ready_for_people([config], page)
                 device = prepare_device(config.device)
                 if pools is None:
                     pools = stack.enter_context(Pools(workers, device, len(found)))
@@ -228,7 +232,7 @@ def resume(
                     raise
                 results.append(unopened(directory, error, watcher))
         try:
-            _check_page([run.trainee.config for run in waiting], page)
+            _ready_for_people([run.trainee.config for run in waiting], page)
         except BadInput:
             _close([run.trainee for run in waiting])
             raise

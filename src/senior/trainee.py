@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ import numpy as np
 
 from senior import checkpoint, envs, labels, parts
 from senior.config import Config, made_by
-from senior.envs.drawing import NoVideo, prepare_opengl
 from senior.envs.episodes import EVALUATION, TRAINING, Episodes, Failure, Local, Step, episode_seed, restore
 from senior.envs.recording import Recording, repeats_itself
 from senior.envs.workers import Remote, Worker
@@ -97,8 +95,6 @@ class Trainee:
         """Whether people can only see what happened if it is filmed when it does: see `senior.envs.recording`."""
         if self.config.teacher != "human" or self.config.env is None:
             return False
-        with suppress(NoVideo):  # it is told when an episode cannot be filmed
-            prepare_opengl()
         return self.directory.films.exists() or not repeats_itself(lambda: make_environment(self.config))
 
     def _film(self) -> Episodes:
@@ -190,7 +186,8 @@ class Trainee:
         the way. Where no episode is running, the latest one is lived through again for that.
         """
         progress, count = self.progress, int(run.replay.count)
-        if self.filmed:  # it cannot be lived through again: the episode that was running is broken off
+        if isinstance(self.environment, Recording):  # it cannot be lived through again: the episode is broken off
+            self.environment.forget(progress.episode)
             progress.episode += bool(progress.elapsed)
             progress.elapsed, progress.episode_return, progress.episode_success = 0, 0.0, None
             self.reset(progress.episode)

@@ -24,10 +24,10 @@ from senior.types import BadInput
 class SweepOptions:
     """Train every combination of options, on this machine or on a Ray cluster.
 
-    Every option of senior train can be given several values: --method m-senior pebble --task door-lock window-open
-    --seed 0 1 2 makes twelve cells; an option that is given twice has the values of both. --arm takes methods with
-    options of their own, "m-senior --select disagreement". Each cell is a run in OUT/TASK/ARM/seed-N; finished ones are
-    skipped, interrupted ones go on.
+    Every option of senior train that says what a run is can be given several values: --method m-senior pebble
+    --task door-lock window-open --seed 0 1 2 makes twelve cells; an option that is given twice has the values of both.
+    --arm takes methods with options of their own, "m-senior --select disagreement". Each cell is a run in
+    OUT/TASK/ARM/seed-N; finished ones are skipped, interrupted ones go on.
     """
 
     out: Path

@@ -69,8 +69,7 @@ class Recording:
     half of one; an episode that is lived through once more is filmed once more, and takes the place of the first.
     The run that goes on after a kill must not live through complete episodes again, as it would elsewhere.
 
-    MuJoCo draws only if `senior.envs.drawing.prepare_opengl` was called before it was imported, as a run does that must
-    be filmed.
+    MuJoCo draws only if `senior.envs.drawing.prepare_opengl` was called before it was imported (`senior.program`).
     """
 
     def __init__(self, local: Local, folder: Path, keep: int, segment: int) -> None:
@@ -93,10 +92,13 @@ class Recording:
         self.folder.mkdir(parents=True, exist_ok=True)
         for unfinished in self.folder.glob("*.part"):
             unfinished.unlink()
-        self._drop([number for number in self._kept() if number >= episode])  # of a life that did not last
         if afresh:
             self._put_away()
         return self._begun(self.local.begin(episode, afresh))
+
+    def forget(self, first: int) -> None:
+        """Throw away the films from that episode on: the run goes on from before they were lived through."""
+        self._drop([number for number in self._kept() if number >= first])
 
     def send(self, action: np.ndarray) -> None:
         """See `senior.envs.episodes.Episodes.send`."""

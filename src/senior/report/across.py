@@ -122,11 +122,11 @@ def label_curves(task: str, arms: Runs, looks: Mapping[str, Look]) -> Drawing | 
 def budget_curves(task: str, arms: Runs) -> Drawing | None:
     """Scores at the end against the budget, for methods that were run with several; None if there are none."""
     found: dict[tuple[str, Fingerprint], dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for label, runs in arms.items():
+    for runs in arms.values():
         for run in runs:
             if run.config is not None and run.asks and run.finished:
                 else_ = tuple(entry for entry in run.arm.fingerprint if entry[0] not in WITH_BUDGET)
-                found[_BUDGET.sub("", label), else_][run.config.queries.budget].append(float(run.score[-1]))
+                found[_BUDGET.sub("", run.arm.name), else_][run.config.queries.budget].append(float(run.score[-1]))
     lines: dict[str, dict[int, list[float]]] = {}
     for (name, _), by_budget in found.items():
         if len(by_budget) > 1:
@@ -179,8 +179,8 @@ def accuracy_curves(task: str, arms: Runs, looks: Mapping[str, Look]) -> Drawing
     frame = Frame(task, STEPS, "prospective accuracy", 1.02 * max(steps[-1] for steps, _ in curves.values()), level=0.5)
     caption = (
         f"{task}: share of pairs that the reward model judged rightly before it was fitted to them, over the latest "
-        f"sessions that have {PAIRS} together, or all there are; mean and standard deviation over seeds. Dotted: "
-        "chance."
+        f"sessions that have {PAIRS} decided ones together, or all there are; mean and standard deviation over seeds. "
+        "Dotted: chance."
     )
     return Drawing(
         f"{task}-accuracy", caption, banded(_deviations(curves), looks, frame), _mean_rows("step", task, curves)

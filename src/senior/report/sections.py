@@ -197,8 +197,8 @@ def reward_model(tasks: Tasks, looks: Mapping[str, Look]) -> Section | None:
         return None
     head = ("task", "arm", "runs", "right of the last pairs", "correlation", "rank correlation", FOUND)
     caption = (
-        f"Prospective accuracy over the latest sessions that have {across.PAIRS} pairs together, or all there are, and "
-        "how learned and true return of an episode go together."
+        f"Prospective accuracy over the latest sessions that have {across.PAIRS} decided pairs together, or all there "
+        "are, and how learned and true return of an episode go together."
     )
     text = (
         "Prospective accuracy is of pairs that the reward model has not seen: it judges a session's pairs before it is "

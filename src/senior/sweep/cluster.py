@@ -144,6 +144,8 @@ class RayCrew:
         except self._ray.exceptions.RayError as error:
             lost = isinstance(error, self._ray.exceptions.RayActorError)
             if lost and self._fallen < self.size + RETRIES:
+                if not self._fallen:
+                    self._say("A worker on the Ray cluster was lost as it began; another one is asked for.")
                 self._fallen += 1
                 self._hire()
                 return
