@@ -17,7 +17,7 @@ from senior.learner import Learner
 from senior.loop import Watcher
 from senior.runs import Lift, prepare_device
 from senior.shape import shape
-from senior.together import Pools, Result, Waiting, train_waiting, unopened
+from senior.together import Pools, Result, Waiting, check_page, train_waiting, unopened
 from senior.trainee import Trainee
 from senior.types import BadInput, EnvSpec
 
@@ -85,7 +85,9 @@ def train_all(
     directory is not empty.
     """
     device = _check_runs(runs, workers, runs_per_device)
-    _ready_for_people([config for config, _ in runs], page)
+    configs = [config for config, _ in runs]
+    _ready_for_people(configs)
+    check_page(configs, page)
     watcher = watcher or Quiet()
     with Pools(workers, device, len(runs)) as pools:
         trainees: list[Trainee] = []
@@ -111,7 +113,7 @@ def continue_all(runs: Sequence[tuple[Config, Path]], watcher: Watcher) -> list[
     """`train_all`, but a run that is there goes on from its newest checkpoint, and a run that cannot be opened, or is
     another one, is told in its own result: the others go on. ``senior sweep`` stands on it."""
     device = _check_runs(runs, None, None)
-    _ready_for_people([config for config, _ in runs], HERE)
+    _ready_for_people([config for config, _ in runs])
     results: dict[Path, Result] = {}
     with Pools(None, device, len(runs)) as pools:
         waiting: list[Waiting] = []
@@ -162,16 +164,14 @@ def _check_runs(runs: Sequence[tuple[Config, Path]], workers: int | None, runs_p
     return prepare_device(runs[0][0].device)
 
 
-def _ready_for_people(configs: Sequence[Config], page: Address) -> None:
-    """Before any environment is made: `BadInput` where people are the teachers, and their pages cannot be served."""
+def _ready_for_people(configs: Sequence[Config]) -> None:
+    """Before any environment is made: what runs need whose teachers are people. `BadInput` if it is not installed."""
     asking = [config for config in configs if config.teacher == "human"]
     if asking:
         check_installed()
     if any(config.env for config in asking):  # they may have to be filmed
         with suppress(NoVideo):  # which is told when an episode cannot be
             prepare_opengl()
-    if len(asking) > 1 and page.port:
-        raise BadInput(f"--port {page.port} is for one page, and each of {len(asking)} runs has its own; leave it out.")
 
 
 def _trainee(config: Config, path: Path, device: str, pools: Pools) -> Trainee:
@@ -218,7 +218,7 @@ def resume(
             trainee = None
             try:
                 config = load(directory / "config.json")
-                _ready_for_people([config], page)
+                _ready_for_people([config])
                 device = prepare_device(config.device)
                 if pools is None:
                     pools = stack.enter_context(Pools(workers, device, len(found)))
@@ -231,11 +231,6 @@ def resume(
                 if len(found) == 1:
                     raise
                 results.append(unopened(directory, error, watcher))
-        try:
-            _ready_for_people([run.trainee.config for run in waiting], page)
-        except BadInput:
-            _close([run.trainee for run in waiting])
-            raise
         return results + train_waiting(waiting, watcher, None, runs_per_device, len(found) == 1, page)
 
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from senior import checkpoint, rundir
+from senior.config import Config
 from senior.envs.workers import Worker, Workers
 from senior.label.serving import Address, Serving
 from senior.learner import Learner, Run
@@ -106,6 +107,13 @@ class _Together:
             self._watcher.say(sentence)
 
 
+def check_page(configs: Sequence[Config], page: Address) -> None:
+    """`BadInput` for a fixed port where several runs have a page."""
+    asking = sum(config.teacher == "human" for config in configs)
+    if asking > 1 and page.port:
+        raise BadInput(f"--port {page.port} is for one page, and each of {asking} runs has its own; leave it out.")
+
+
 def train_waiting(
     waiting: Sequence[Waiting],
     watcher: Watcher,
@@ -123,6 +131,7 @@ def train_waiting(
     left = sorted(waiting, key=lambda run: run.trainee.config.device)
     pages = ExitStack()
     try:
+        check_page([trainee.config for trainee, _ in waiting], page)
         for trainee, _ in waiting:
             if trainee.config.teacher == "human":
                 standing = checkpoint.standing(trainee.directory.checkpoints) or {}

@@ -25,7 +25,6 @@ AHEAD = 3
 PAUSE_SECONDS = 120.0
 """Between answers, what is longer is no work and does not count in the rate."""
 
-
 Side = Literal["left", "right", "equal", "skip"]
 
 

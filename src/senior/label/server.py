@@ -44,9 +44,9 @@ def standing_of(run: Path, config: Config) -> Standing:
 def access_to(address: Address, port: int, token: str) -> Access:
     """Who is let in at an address."""
     local = is_loopback(address.host)
-    names = {address.host.lower(), *(("127.0.0.1", "::1") if local else (socket.gethostname().lower(),))}
-    allowed = {name.lower() for name in address.allowed_hosts}
-    return Access(token, f"senior-{port}", frozenset({"localhost", *names, *allowed}), anywhere=not local)
+    own = ("127.0.0.1", "::1") if local else (socket.gethostname(),)
+    names = {name.lower() for name in ("localhost", address.host, *own, *address.allowed_hosts)}
+    return Access(token, f"senior-{port}", frozenset(names), anywhere=not local)
 
 
 def _token(folder: Path, wanted: str | None) -> str:

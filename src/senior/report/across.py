@@ -8,7 +8,7 @@ read off straight lines between their evaluations, as far as all of them have co
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -33,7 +33,6 @@ WITH_BUDGET = ("--budget", "--per-session")
 """Options that differ between the budgets of one line."""
 
 _BUDGET = re.compile(r" --budget \d+")
-_NUMBER = re.compile(r" \[\d+\]$")
 
 
 def together(curves: Sequence[Curve]) -> Curve:
@@ -125,13 +124,14 @@ def budget_curves(task: str, arms: Runs) -> Drawing | None:
     for runs in arms.values():
         for run in runs:
             if run.config is not None and run.asks and run.finished:
-                else_ = tuple(entry for entry in run.arm.fingerprint if entry[0] not in WITH_BUDGET)
-                found[_BUDGET.sub("", run.arm.name), else_][run.config.queries.budget].append(float(run.score[-1]))
+                rest = tuple(entry for entry in run.arm.fingerprint if entry[0] not in WITH_BUDGET)
+                found[_BUDGET.sub("", run.arm.name), rest][run.config.queries.budget].append(float(run.score[-1]))
     lines: dict[str, dict[int, list[float]]] = {}
+    seen: Counter[str] = Counter()
     for (name, _), by_budget in found.items():
         if len(by_budget) > 1:
-            again = sum(_NUMBER.sub("", label) == name for label in lines)
-            lines[f"{name} [{again + 1}]" if again else name] = by_budget
+            seen[name] += 1
+            lines[name if seen[name] == 1 else f"{name} [{seen[name]}]"] = by_budget
     several = {label: lines[label] for label in in_order(lines)}
     if not several:
         return None

@@ -91,7 +91,6 @@ class Episodes(NamedTuple):
     episode_success: np.ndarray
     learned_return: np.ndarray
     queried: np.ndarray
-    labels: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +114,8 @@ class Run:
     evaluation: Evaluations
     episodes: Episodes | None
     """None where ``train.csv`` cannot be read."""
-    foretold: Sequence[Foretold]
-    """Empty where nobody is asked, and where ``preferences.sqlite`` is not there or cannot be read."""
+    foretold: Sequence[Foretold] | None
+    """None where nobody is asked, or ``preferences.sqlite`` cannot be read; empty where it is not there."""
     seconds: float | None
     """Wall time of training up to the last evaluation, pauses between processes left out; None where not told."""
 
@@ -160,7 +159,6 @@ def read_run(path: Path, known: dict[str, Config | None], left_out: list[LeftOut
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise Unusable(f"config.json is damaged: {error}") from error
     arm = Arm(task, method if config is None else label(config), fingerprint)
-    preferences = path / PREFERENCES
     evaluation = _evaluations(path / "eval.csv")
     return Run(
         path,
@@ -174,7 +172,7 @@ def read_run(path: Path, known: dict[str, Config | None], left_out: list[LeftOut
         protocol,
         evaluation,
         _or_none(_episodes, path / "train.csv", left_out),
-        (_or_none(_foretold, preferences, left_out) if asks and preferences.exists() else None) or (),
+        _or_none(_foretold, path / PREFERENCES, left_out) if asks else None,
         _or_none(_seconds, path / "timing.csv", left_out),
     )
 
@@ -276,6 +274,8 @@ def preferences_in(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _foretold(path: Path) -> list[Foretold]:
+    if not path.exists():
+        return []
     with preferences_in(path) as db:
         return foretold(db)
 

@@ -111,7 +111,7 @@ def cells_of(grid: Grid, out: Path) -> list[Cell]:
         chosen = dict(zip(axes, values, strict=True))
         arm = chosen.pop("arm")
         config = configured(arm, chosen)
-        name = "-".join([arm, *(f"{name}-{_word(chosen[name])}" for name in varied)])
+        name = "-".join([arm, *(f"{option}-{_word(chosen[option])}" for option in varied)])
         cells.append(Cell(config, place(out, config, name)))
     return cells
 
