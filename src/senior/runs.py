@@ -194,9 +194,11 @@ class _Stacked:
 
     def __init__(self, results: Any) -> None:
         self._results = results
+        self._fetched = False
 
     def __getitem__(self, i: int) -> Any:
-        self._results = jax.device_get(self._results)
+        if not self._fetched:
+            self._results, self._fetched = jax.device_get(self._results), True
         return jax.tree.map(lambda leaf: leaf[i], self._results)
 
 
@@ -225,7 +227,11 @@ def prepare_device(wanted: str) -> str:
     found = jax.default_backend()
     if wanted == "gpu" and found != "gpu":
         raise BadInput("--device gpu: JAX finds no GPU here; install the extra senior-rl[gpu] or use --device cpu.")
-    return "gpu" if found == "gpu" else "cpu"
+    if found != "gpu":
+        return "cpu"
+    # products of float32 are rounded to TensorFloat-32 otherwise, of ten bits, and results/precision has what eight do
+    jax.config.update("jax_default_matmul_precision", "float32")
+    return "gpu"
 
 
 def _avoid_hang() -> None:
