@@ -87,6 +87,7 @@ class Training:
         self.watcher = watcher
         self.clock = Clock(trainees[0].progress.step)
         self.last = max(trainee.config.steps for trainee in trainees)
+        self.sent: list[int] = []  # runs whose environments were told to take a step
         self.waits = False  # wait for the device after each part, so that its time is that part's (senior bench)
 
     def train(self) -> None:
@@ -118,12 +119,16 @@ class Training:
                 with self.clock.part("session"):
                     for i in self.active():
                         self.now_and_then(i, step, plans[i], i in heard)
+            elif (
+                self.runs.lift == "vmap"
+            ):  # the environments live in workers: they step while the update is handed over
+                self.send(actions)
             with self.clock.part("update"):
                 update = self.update(step, plans)
                 if self.waits:
                     self.wait(update)
             if happened is None:
-                happened = self.take(actions, step)
+                happened = self.receive(step) if self.sent else self.take(actions, step)
             with self.clock.part("store"):
                 self.store(step, plans, happened, update)
                 if self.waits:
@@ -146,14 +151,27 @@ class Training:
     # Every step.
 
     def take(self, actions: PerRun, step: int) -> list[Step | None]:
-        """Step the environments; a run whose environment breaks is saved as it was, and stopped."""
-        happened: list[Step | None] = [None] * len(self.trainees)
+        """Step the environments."""
+        self.send(actions)
+        return self.receive(step)
+
+    def send(self, actions: PerRun) -> None:
+        """Have the environments take a step."""
         with self.clock.part("act"):
             chosen = {i: np.asarray(actions[i]) for i in self.active()}
         with self.clock.part("environment"):
             for i, action in chosen.items():
                 self.trainees[i].environment.send(action)
             for i in chosen:
+                self.trainees[i].environment.set_out()
+        self.sent = list(chosen)
+
+    def receive(self, step: int) -> list[Step | None]:
+        """What the step gave; a run whose environment breaks is saved as it was, and stopped."""
+        happened: list[Step | None] = [None] * len(self.trainees)
+        sent, self.sent = self.sent, []
+        with self.clock.part("environment"):
+            for i in sent:
                 result = self.trainees[i].environment.receive()
                 self.note(i, self.trainees[i].environment)
                 if isinstance(result, Failure):

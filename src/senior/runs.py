@@ -109,10 +109,12 @@ class Runs:
         active: Sequence[bool],
         columns: Sequence[Sequence[Any]],
     ) -> Proposal:
-        function = compiled(of_one, self.lift, tuple(changes), donate)
         if self.lift == "vmap":
             assert self._stack is not None
-            return Proposal(changes, *function(*_part(self._stack, changes), *map(_stack, columns)))
+            packed, form = _pack(columns)
+            function = compiled(of_one, self.lift, tuple(changes), donate, form)
+            return Proposal(changes, *function(*_part(self._stack, changes), packed))
+        function = compiled(of_one, self.lift, tuple(changes), donate)
         fields, results = [None] * self.size, [None] * self.size
         for i, state in enumerate(self._loop):
             if active[i]:
@@ -128,10 +130,11 @@ class Runs:
         *columns: Sequence[Any],
     ) -> PerRun:
         """Call a function of a part of the state, which it leaves as it is, for all active runs."""
-        function = compiled(of_part, self.lift, None, donate=False)
         if self.lift == "vmap":
-            stacked = [_stack(column) for column in columns]
-            return _Stacked(function(pick(self._stack), *stacked))  # pyright: ignore[reportArgumentType]
+            packed, form = _pack(columns)
+            function = compiled(of_part, self.lift, None, False, form)
+            return _Stacked(function(pick(self._stack), packed))  # pyright: ignore[reportArgumentType]
+        function = compiled(of_part, self.lift, None, donate=False)
         return [
             function(pick(state), *(column[i] for column in columns)) if active[i] else None
             for i, state in enumerate(self._loop)
@@ -147,21 +150,68 @@ class Runs:
         return result
 
 
+class _Form(NamedTuple):
+    """How the arguments of one run lie in a row of words of 32 bits."""
+
+    tree: Any
+    leaves: tuple[tuple[tuple[int, ...], np.dtype], ...]  # shape and type
+
+    def take_apart(self, row: jax.Array) -> Any:
+        """The arguments that lie in a row; traced."""
+        ends = np.cumsum([int(np.prod(shape)) for shape, _ in self.leaves])
+        leaves = []
+        for words, (shape, kind) in zip(jnp.split(row, ends[:-1]), self.leaves, strict=True):
+            words = words.reshape(shape)
+            leaves.append(words != 0 if kind.kind == "b" else jax.lax.bitcast_convert_type(words, kind))
+        return jax.tree.unflatten(self.tree, leaves)
+
+
+def _pack(columns: Sequence[Sequence[Any]]) -> tuple[np.ndarray, _Form]:
+    """Arguments of all runs, numbers and arrays of the host or named tuples of them, as one array with a row per run:
+    whatever goes to a GPU by itself costs a tenth of a millisecond or more, however small it is."""
+    leaves: list[np.ndarray] = []
+    for column in columns:
+        leaves += map(np.array, zip(*column, strict=True) if isinstance(column[0], tuple) else [column])
+    tree = jax.tree.structure([column[0] for column in columns])
+    form = _Form(tree, tuple((leaf.shape[1:], leaf.dtype) for leaf in leaves))
+    return np.concatenate([_words(leaf) for leaf in leaves], axis=1), form
+
+
+def _words(leaf: np.ndarray) -> np.ndarray:
+    """The words of 32 bits of each row."""
+    words = leaf.astype(np.uint32) if leaf.dtype == bool else leaf
+    assert words.dtype.itemsize == 4, f"{leaf.dtype} has no words of 32 bits"
+    return words.view(np.uint32).reshape(len(leaf), -1)
+
+
 @lru_cache(maxsize=256)
 def compiled(
-    of_one: Callable[..., Any], lift: Lift, changes: tuple[str, ...] | Literal["all"] | None, donate: bool
+    of_one: Callable[..., Any],
+    lift: Lift,
+    changes: tuple[str, ...] | Literal["all"] | None,
+    donate: bool,
+    form: _Form | None = None,
 ) -> Any:
     """A function of one run, lifted and compiled. The same function is the same program for all that use it.
 
     changes: fields of every run that it changes; "all": it may change everything of the one run it is called for;
-    None: it changes nothing.
+    None: it changes nothing. form: how the arguments after the state are packed, if they are.
     """
     if changes == "all":
         function = of_one if lift == "loop" else _at(of_one)
     else:
         function = _of_part(of_one, changes) if changes else of_one
+        function = _of_row(function, form) if form else function
         function = function if lift == "loop" else jax.vmap(function)
     return jax.jit(function, donate_argnums=0 if donate else ())
+
+
+def _of_row(function: Callable[..., Any], form: _Form) -> Callable[..., Any]:
+    def call(*states_and_row: Any) -> Any:
+        *states, row = states_and_row
+        return function(*states, *form.take_apart(row))
+
+    return call
 
 
 def _part(state: Run, changes: Sequence[str]) -> tuple[tuple[Any, ...], Run]:
@@ -183,10 +233,8 @@ def _of_part(of_one: OfOneRun, changes: Sequence[str]) -> Callable[..., tuple[tu
 
 
 def _stack(trees: Sequence[Any]) -> Any:
-    """One tree with a leading run axis. What is on the host is put together there, to go to the device at once."""
-    on_host = all(isinstance(leaf, (np.ndarray, np.generic)) for leaf in jax.tree.leaves(trees[0]))
-    stack = np.stack if on_host else jnp.stack
-    return jax.tree.map(lambda *leaves: stack(leaves), *trees)
+    """One tree with a leading run axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
 class _Stacked:

@@ -62,6 +62,10 @@ class Episodes(Protocol):
         """Have ``action``, float32 [a] in [-1, 1], taken; `receive` tells what it did."""
         ...
 
+    def set_out(self) -> None:
+        """Begin what was sent, where that can be done while others work; `receive` does it otherwise."""
+        ...
+
     def receive(self) -> Step | Failure:
         """What the action did. After an episode's end the next one has begun.
 
@@ -130,6 +134,9 @@ class Local:
     def send(self, action: np.ndarray) -> None:
         """See `Episodes.send`; it is taken when `receive` is called."""
         self._action = np.array(action, np.float32)
+
+    def set_out(self) -> None:
+        """See `Episodes.set_out`."""
 
     def receive(self) -> Step | Failure:
         """See `Episodes.receive`."""

@@ -104,6 +104,9 @@ class Recording:
         """See `senior.envs.episodes.Episodes.send`."""
         self.local.send(action)
 
+    def set_out(self) -> None:
+        """See `Episodes.set_out`."""
+
     def receive(self) -> Step | Failure:
         """See `senior.envs.episodes.Episodes.receive`. The scene that ends an episode is no frame."""
         came = self.local.receive()

@@ -207,6 +207,10 @@ class Remote:
             self._under_way = True
             self._send()
 
+    def set_out(self) -> None:
+        """See `Episodes.set_out`."""
+        self._worker.set_out()
+
     def receive(self) -> Step | Failure:
         """See `Episodes.receive`."""
         self._under_way = False
