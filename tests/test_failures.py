@@ -158,7 +158,7 @@ def test_only_the_run_that_broke_stops_and_it_can_go_on(
 def test_under_vmap_too_only_the_run_that_broke_stops_with_its_step_undone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """The update of step 649 is under way when the environment breaks; the checkpoint is as if it was left off there."""
+    """The update of step 649 is under way when the environment breaks; the checkpoint is as if it had been stopped."""
     break_it(monkeypatch, Fault("raise", 650))
     said = Said()
     good, broken = train(config(), tmp_path / "broken", seeds=2, watcher=said, lift="vmap")
