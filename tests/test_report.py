@@ -27,12 +27,15 @@ from senior.options import parse
 from senior.preference_file import Foretold
 from senior.presets import preset, release, with_budget
 from senior.report import across, sections
+from senior.report.asked import asked
 from senior.report.bands import MOST, Band, Frame, banded
 from senior.report.bands import grid as grid_of_panels
+from senior.report.bonus import steps_of
 from senior.report.build import Built, report
 from senior.report.looks import COLOURS, in_order, looks
 from senior.report.names import label, normal, options
 from senior.report.page import Drawing, Section, Table, write
+from senior.report.plane import visited
 from senior.report.records import NOT_TOLD
 from senior.report.results import Results, read
 from senior.report.statistics import interquartile_means
@@ -271,6 +274,34 @@ def test_a_line_that_is_being_written_does_not_count(tmp_path: Path):
     assert reasons(read([tmp_path]))["run"] == "unfinished: it stands at step 30,000 of 40,000"
     [run] = read([tmp_path], unfinished=True).runs
     assert list(run.score) == [0, 0, 0.5]
+
+
+def test_runs_can_be_looked_at_up_to_a_step(tmp_path: Path):
+    """Then all that is read of a run is as if its files ended there."""
+    own = replace(preset("paper", "door-lock", "m-senior"), steps=40_000, snapshot_every=10_000)
+    whole, short = (write_run(tmp_path / name, own) for name in ("whole", "short"))
+    for name in CSV_FILES:
+        head, *lines = (short / name).read_text().splitlines(keepends=True)
+        (short / name).write_text(head + "".join(line for line in lines if int(line.partition(",")[0]) <= 20_000))
+    with closing(sqlite3.connect(short / "preferences.sqlite")) as db, db:
+        db.execute("DELETE FROM pairs WHERE step > 20000")
+    write_run(tmp_path / "behind", replace(own, seed=1), until=10_000)
+
+    [expected] = read([short], unfinished=True).runs
+    found = read([whole, tmp_path / "behind"], until=20_000)
+    [run] = found.runs
+    assert (
+        run.finished and run.steps == 20_000 and reasons(found)["behind"] == "it stands at step 10,000, before 20,000"
+    )
+    for field in ("evaluation", "episodes"):
+        np.testing.assert_array_equal(getattr(run, field), getattr(expected, field), err_msg=field)
+    assert run.foretold == expected.foretold and run.foretold and run.seconds == expected.seconds
+    assert list(visited(run)) == [10_000, 20_000] and list(steps_of(run)) == [20_000]
+    held, same, all_of_it = (asked(one) for one in (run, expected, read([whole]).runs[0]))
+    assert held and same and all_of_it
+    assert held.id.tolist() == same.id.tolist() == all_of_it.id[: len(held.id)].tolist()
+    assert len(held.id) < len(all_of_it.id)
+    assert reasons(read([whole], until=25_000))["whole"] == "it was not evaluated at step 25,000"
 
 
 def test_one_seed_counts_once_and_a_finished_run_first(tmp_path: Path):

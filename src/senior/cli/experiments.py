@@ -171,6 +171,8 @@ class ReportOptions:
     """Run directories, or directories that hold some."""
     out: Path
     """Directory that takes index.html, figures/ and tables/."""
+    until: int | None = None
+    """Look at all runs as if they had ended at this step, at which they must have been evaluated."""
 
 
 def report(arguments: list[str]) -> int:
@@ -180,7 +182,7 @@ def report(arguments: list[str]) -> int:
     from senior.report.build import counted, report
     from senior.report.results import grouped
 
-    built = report(options.runs, options.out)
+    built = report(options.runs, options.out, until=options.until)
     for line in grouped(built.left_out):
         print(f"left out: {line}", file=sys.stderr)
     print(f"{counted(built.runs, 'run')}: {built.page}")

@@ -69,7 +69,8 @@ def asked(run: Run) -> Asked | None:
         steps, size, _ = db.execute("SELECT * FROM shape").fetchone()
         rows = db.execute(
             "SELECT id, session, step, episode_0, episode_1, observation, reward, scores, second, collected_step "
-            "FROM pairs WHERE reserve = 0 OR collected_step IS NOT NULL ORDER BY id"
+            "FROM pairs WHERE (reserve = 0 OR collected_step IS NOT NULL) AND step <= ? ORDER BY id",
+            (run.steps,),
         )
         return _arrays(rows, (2, steps, size), where, run.arm.task in TASKS, _first_episodes(run))
 

@@ -112,7 +112,7 @@ def steps_of(run: Run) -> dict[int, Path]:
         number = path.stem.removeprefix("step-")
         if number.isdecimal():
             found[int(number)] = path
-    return dict(sorted(found.items()))
+    return {step: path for step, path in sorted(found.items()) if step <= run.steps}
 
 
 def samples(run: Run, path: Path) -> Samples:
@@ -238,6 +238,7 @@ def size_of(run: Run) -> Size:
     told = columns(run.path / "train.csv", ("step",), welcome)
     learned = np.abs(told["learned_return"] / told["episode_length"])
     paid = np.isfinite(told["bonus_mean"]) & np.isfinite(told["beta"]) & np.isfinite(learned)
+    paid &= told["step"] <= run.steps
     queried = told["queried"][paid]
     asking = queried < queried.max(initial=-math.inf)
     return Size(told["step"][paid], told["beta"][paid], told["bonus_mean"][paid], learned[paid], asking)

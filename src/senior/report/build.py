@@ -33,22 +33,28 @@ def check_installed() -> None:
     require("A report", "report", "jinja2", "rliable")
 
 
-def report(places: Sequence[Path], out: Path, first: Sequence[Section] = (), unfinished: bool = False) -> Built:
+def report(
+    places: Sequence[Path],
+    out: Path,
+    first: Sequence[Section] = (),
+    unfinished: bool = False,
+    until: int | None = None,
+) -> Built:
     """Read all runs at or below ``places`` and write the page, its figures and tables into ``out``.
 
     first: sections that stand before all others. unfinished: show runs under way too, in curves as far as they have
-    come; tables of success are of finished runs alone.
+    come; tables of success are of finished runs alone. until: look at all runs as if they had ended at that step.
 
     Raises `BadInput` if there is no run with an evaluation, if ``out`` cannot be written, or if what draws the page is
     not installed.
     """
-    return page_of(found(places, unfinished), out, first)
+    return page_of(found(places, unfinished, until), out, first)
 
 
-def found(places: Sequence[Path], unfinished: bool = False) -> Results:
+def found(places: Sequence[Path], unfinished: bool = False, until: int | None = None) -> Results:
     """What a report on ``places`` is made of. `BadInput` as from `report`."""
     check_installed()
-    results = read(places, unfinished)
+    results = read(places, unfinished, until)
     if not results.runs:
         raise BadInput(_nothing(places, results))
     return results
@@ -66,7 +72,7 @@ def page_of(results: Results, out: Path, first: Sequence[Section] = ()) -> Built
 
 def _parts(results: Results, tasks: Tasks, colours: Mapping[str, Look]) -> Iterator[Section | None]:
     """One by one, when they are asked for."""
-    yield sections.summary(tasks, results.shared)
+    yield sections.summary(tasks, results.shared, results.until)
     yield sections.curves(tasks, colours)
     yield sections.labels(tasks, colours)
     yield comparison.comparison(tasks, colours)

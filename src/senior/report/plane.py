@@ -101,7 +101,7 @@ def visited(run: Run) -> dict[int, np.ndarray]:
         raise Unusable(f"{POSITIONS} cannot be used: {error}") from error
     if any(array.ndim != 2 or not len(array) or not np.isfinite(array).all() for array in found.values()):
         raise Unusable(f"{POSITIONS} is damaged: it holds something else than positions")
-    return dict(sorted(found.items()))
+    return {step: positions for step, positions in sorted(found.items()) if step <= run.steps}
 
 
 def firsts(arms: Arms, left_out: list[LeftOut]) -> list[Asked]:

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -93,6 +93,9 @@ class Episodes(NamedTuple):
     queried: np.ndarray
 
 
+Told = TypeVar("Told", Evaluations, Episodes)
+
+
 @dataclass(frozen=True, eq=False)
 class Run:
     """A run directory."""
@@ -103,7 +106,7 @@ class Run:
     method: str
     """Name of its row, without options."""
     steps: int
-    """That it is to take."""
+    """That it is to take, or up to which it is looked at."""
     main_phase: int
     """The step at which pre-training ends."""
     asks: bool
@@ -175,6 +178,29 @@ def read_run(path: Path, known: dict[str, Config | None], left_out: list[LeftOut
         _or_none(_foretold, path / PREFERENCES, left_out) if asks else None,
         _or_none(_seconds, path / "timing.csv", left_out),
     )
+
+
+def up_to(run: Run, step: int) -> Run:
+    """A run as if it had ended at that step. Raises `Unusable` where it was not evaluated there."""
+    told, episodes, seconds = run.evaluation, run.episodes, run.seconds
+    if run.step < step:
+        raise Unusable(f"it stands at step {run.step:,}, before {step:,}")
+    if step not in told.step:
+        raise Unusable(f"it was not evaluated at step {step:,}")
+    if seconds is not None:
+        seconds = _seconds(run.path / "timing.csv", step)
+    return replace(
+        run,
+        steps=step,
+        evaluation=_rows(told, told.step <= step),
+        episodes=None if episodes is None else _rows(episodes, episodes.step <= step),
+        foretold=None if run.foretold is None else [one for one in run.foretold if one.step <= step],
+        seconds=seconds,
+    )
+
+
+def _rows(told: Told, chosen: np.ndarray) -> Told:
+    return told._make(None if column is None else column[chosen] for column in told)
 
 
 def _config(given: dict[str, Any], known: dict[str, Config | None]) -> Config | None:
@@ -310,9 +336,10 @@ def _episodes(path: Path) -> Episodes:
     return Episodes(*(found[name] for name in Episodes._fields))
 
 
-def _seconds(path: Path) -> float:
+def _seconds(path: Path, until: float = math.inf) -> float:
     """The clock begins anew with every process that goes on with the run, and then does not fit the rate."""
     told = columns(path, ("step", "seconds"), ("steps_per_second",))
+    told = {name: column[told["step"] <= until] for name, column in told.items()}
     clock = told["seconds"]
     if not len(clock) or not np.isfinite(clock).all():
         raise Unusable(f"{path.name} tells no time")

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from senior.config import Config
 from senior.report.names import words
-from senior.report.records import NOT_TOLD, Arm, Fingerprint, LeftOut, Run, Unusable, read_run
+from senior.report.records import NOT_TOLD, Arm, Fingerprint, LeftOut, Run, Unusable, read_run, up_to
 from senior.rundir import is_run
 
 MOST_NAMED = 2
@@ -28,6 +28,8 @@ class Results(NamedTuple):
     left_out: tuple[LeftOut, ...]
     shared: tuple[str, ...] = ()
     """Options that all arms have and their labels do not tell."""
+    until: int | None = None
+    """The step at which runs are looked at as if they had ended; None: each at its own end."""
 
     def arms(self) -> dict[Arm, list[Run]]:
         """Runs by arm, both in order."""
@@ -37,8 +39,12 @@ class Results(NamedTuple):
         return dict(found)
 
 
-def read(places: Sequence[Path], unfinished: bool = False) -> Results:
-    """All run directories at or below ``places``. ``unfinished``: take in runs under way that were evaluated once."""
+def read(places: Sequence[Path], unfinished: bool = False, until: int | None = None) -> Results:
+    """All run directories at or below ``places``.
+
+    unfinished: take in runs under way that were evaluated once. until: look at all runs as if they had ended at that
+    step; those that were not evaluated there are left out.
+    """
     left_out: list[LeftOut] = []
     runs: list[Run] = []
     known: dict[str, Config | None] = {}
@@ -46,6 +52,7 @@ def read(places: Sequence[Path], unfinished: bool = False) -> Results:
         missed: list[LeftOut] = []
         try:
             run = read_run(path, known, missed)
+            run = run if until is None else up_to(run, until)
             if not (run.finished or unfinished):
                 raise Unusable(f"unfinished: it stands at step {run.step:,} of {run.steps:,}")
             runs.append(run)
@@ -54,7 +61,7 @@ def read(places: Sequence[Path], unfinished: bool = False) -> Results:
             left_out.append(LeftOut(path, str(reason)))
     runs = _of_one_measure(runs, left_out)
     runs, shared = _unshared(_once(runs, left_out))
-    return Results(tuple(sorted(_told_apart(runs), key=_order)), tuple(left_out), shared)
+    return Results(tuple(sorted(_told_apart(runs), key=_order)), tuple(left_out), shared, until)
 
 
 def _order(run: Run) -> tuple[Any, ...]:

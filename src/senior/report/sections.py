@@ -58,10 +58,10 @@ def by_task(runs: Sequence[Run]) -> dict[str, dict[str, list[Run]]]:
     return {task: {label: found[task][label] for label in in_order(found[task])} for task in sorted(found)}
 
 
-def summary(tasks: Tasks, shared: Sequence[str] = ()) -> Section:
+def summary(tasks: Tasks, shared: Sequence[str] = (), until: int | None = None) -> Section:
     """Success at two steps, intervals and areas, a line per arm; with several tasks, the paper's table too.
 
-    shared: options of all arms, which their labels do not tell.
+    shared: options of all arms, which their labels do not tell. until: the step that all runs are cut at.
     """
     by_marks: dict[tuple[int, int], dict[str, dict[str, Sequence[Run]]]] = defaultdict(lambda: defaultdict(dict))
     for task, arms in tasks.items():
@@ -84,6 +84,10 @@ def summary(tasks: Tasks, shared: Sequence[str] = ()) -> Section:
     ]
     if shared:
         text.append(f"All arms that ask for answers have, beside what their names tell: {' '.join(shared)}.")
+    if until is not None:
+        text.append(
+            f"All runs are looked at up to step {until:,}, as if they had ended there, whatever they were to take."
+        )
     short = sorted({run.steps for run in runs if run.steps < PAPER[1]})
     if short:
         text.append(
