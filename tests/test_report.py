@@ -284,15 +284,20 @@ def test_runs_can_be_looked_at_up_to_a_step(tmp_path: Path):
         head, *lines = (short / name).read_text().splitlines(keepends=True)
         (short / name).write_text(head + "".join(line for line in lines if int(line.partition(",")[0]) <= 20_000))
     with closing(sqlite3.connect(short / "preferences.sqlite")) as db, db:
-        db.execute("DELETE FROM pairs WHERE step > 20000")
+        db.execute("DELETE FROM pairs WHERE step >= 20000")  # a run asks nothing where it ends
     write_run(tmp_path / "behind", replace(own, seed=1), until=10_000)
+    late = write_run(tmp_path / "late", replace(own, seed=2))
+    (late / "timing.csv").write_text("step,seconds,steps_per_second\n30000,300,100\n")
 
     [expected] = read([short], unfinished=True).runs
-    found = read([whole, tmp_path / "behind"], until=20_000)
-    [run] = found.runs
-    assert (
-        run.finished and run.steps == 20_000 and reasons(found)["behind"] == "it stands at step 10,000, before 20,000"
-    )
+    found = read([whole, late, tmp_path / "behind"], until=20_000)
+    run, timeless = found.runs
+    assert run.finished and run.steps == 20_000
+    assert reasons(found) == {
+        "behind": "it stands at step 10,000, before 20,000",
+        "timing.csv": "timing.csv tells no time",
+    }
+    assert timeless.seed == 2 and timeless.seconds is None
     for field in ("evaluation", "episodes"):
         np.testing.assert_array_equal(getattr(run, field), getattr(expected, field), err_msg=field)
     assert run.foretold == expected.foretold and run.foretold and run.seconds == expected.seconds

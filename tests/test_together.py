@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter, defaultdict
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 from senior import fit, learner, parts, together
 from senior.config import Config
 from senior.learner import Learner
+from senior.loop import Training
 from senior.methods import METHODS
 from senior.presets import preset, release
 from senior.program import Quiet, make_learner, resume, train_all
@@ -190,9 +192,25 @@ def test_under_vmap_a_run_depends_neither_on_its_neighbour_nor_on_the_program_be
     assert_same_run(tmp_path / "one" / "a", tmp_path / "two" / "a", interrupted=False)
 
 
-def test_programs_side_by_side_have_workers_of_their_own(tmp_path: Path):
+def test_programs_side_by_side_have_workers_of_their_own_which_step_during_the_update(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    done: dict[int, list[str]] = defaultdict(list)
+    for name in ("send", "update", "receive"):
+        plain = getattr(Training, name)
+
+        def noted(training: Training, *arguments: Any, name: str = name, plain: Any = plain) -> Any:
+            done[id(training)].append(name)
+            return plain(training, *arguments)
+
+        monkeypatch.setattr(Training, name, noted)
     runs = [(short(steps=500), tmp_path / "a"), (small("sac", steps=500), tmp_path / "b")]
     assert all(result.finished for result in train_all(runs, Said(), lift="vmap", workers=1))
+    assert len(done) == 2
+    for names in done.values():
+        steps = Counter(zip(*[iter(names)] * 3, strict=True))
+        assert steps.total() == 500
+        assert steps["send", "update", "receive"] >= 490, steps  # but where something rare is due
 
 
 class Breaks(Said):

@@ -119,10 +119,8 @@ class Training:
                 with self.clock.part("session"):
                     for i in self.active():
                         self.now_and_then(i, step, plans[i], i in heard)
-            elif (
-                self.runs.lift == "vmap"
-            ):  # the environments live in workers: they step while the update is handed over
-                self.send(actions)
+            elif self.runs.lift == "vmap" and not self.waits:
+                self.send(actions)  # environments in workers step while the update is handed over
             with self.clock.part("update"):
                 update = self.update(step, plans)
                 if self.waits:

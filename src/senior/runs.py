@@ -167,8 +167,8 @@ class _Form(NamedTuple):
 
 
 def _pack(columns: Sequence[Sequence[Any]]) -> tuple[np.ndarray, _Form]:
-    """Arguments of all runs, numbers and arrays of the host or named tuples of them, as one array with a row per run:
-    whatever goes to a GPU by itself costs a tenth of a millisecond or more, however small it is."""
+    """Arguments of all runs, a column or more of the host's numbers, arrays or named tuples of them, as one array with
+    a row per run: whatever goes to a GPU by itself costs half a millisecond or more, however small it is."""
     leaves: list[np.ndarray] = []
     for column in columns:
         leaves += map(np.array, zip(*column, strict=True) if isinstance(column[0], tuple) else [column])
@@ -259,7 +259,8 @@ def _at(of_one: OfOneRun) -> Callable[..., tuple[Any, Any]]:
 
 
 def prepare_device(wanted: str) -> str:
-    """Choose where to compute and switch the compilation cache on; returns ``cpu`` or ``gpu``.
+    """Choose where to compute, switch the compilation cache on, and have a GPU multiply in float32; returns ``cpu`` or
+    ``gpu``.
 
     Raises `BadInput` if a GPU is asked for and there is none.
     """

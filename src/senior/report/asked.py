@@ -68,9 +68,10 @@ def asked(run: Run) -> Asked | None:
     with preferences_in(path) as db:
         steps, size, _ = db.execute("SELECT * FROM shape").fetchone()
         rows = db.execute(
-            "SELECT id, session, step, episode_0, episode_1, observation, reward, scores, second, collected_step "
-            "FROM pairs WHERE (reserve = 0 OR collected_step IS NOT NULL) AND step <= ? ORDER BY id",
-            (run.steps,),
+            "SELECT id, session, step, episode_0, episode_1, observation, reward, scores, "
+            "CASE WHEN collected_step < :end THEN second END, CASE WHEN collected_step < :end THEN collected_step END "
+            "FROM pairs WHERE (reserve = 0 OR collected_step < :end) AND step < :end ORDER BY id",
+            {"end": run.steps},  # where a run ends it asks no more
         )
         return _arrays(rows, (2, steps, size), where, run.arm.task in TASKS, _first_episodes(run))
 

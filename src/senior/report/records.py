@@ -180,7 +180,7 @@ def read_run(path: Path, known: dict[str, Config | None], left_out: list[LeftOut
     )
 
 
-def up_to(run: Run, step: int) -> Run:
+def up_to(run: Run, step: int, left_out: list[LeftOut]) -> Run:
     """A run as if it had ended at that step. Raises `Unusable` where it was not evaluated there."""
     told, episodes, seconds = run.evaluation, run.episodes, run.seconds
     if run.step < step:
@@ -188,13 +188,13 @@ def up_to(run: Run, step: int) -> Run:
     if step not in told.step:
         raise Unusable(f"it was not evaluated at step {step:,}")
     if seconds is not None:
-        seconds = _seconds(run.path / "timing.csv", step)
+        seconds = _or_none(lambda path: _seconds(path, step), run.path / "timing.csv", left_out)
     return replace(
         run,
         steps=step,
         evaluation=_rows(told, told.step <= step),
         episodes=None if episodes is None else _rows(episodes, episodes.step <= step),
-        foretold=None if run.foretold is None else [one for one in run.foretold if one.step <= step],
+        foretold=None if run.foretold is None else [one for one in run.foretold if one.step < step],
         seconds=seconds,
     )
 

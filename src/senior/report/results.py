@@ -52,7 +52,7 @@ def read(places: Sequence[Path], unfinished: bool = False, until: int | None = N
         missed: list[LeftOut] = []
         try:
             run = read_run(path, known, missed)
-            run = run if until is None else up_to(run, until)
+            run = run if until is None else up_to(run, until, missed)
             if not (run.finished or unfinished):
                 raise Unusable(f"unfinished: it stands at step {run.step:,} of {run.steps:,}")
             runs.append(run)
