@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,10 @@ from senior.files import unpack
 from senior.judgement import evaluate_run
 from senior.program import Quiet, Result, resume, train
 from senior.rundir import saved_steps
-from senior.trainee import Trainee
 from senior.types import BadInput
 from tests.equal import assert_same_run, progress_of
 from tests.small import rows, small
+from tests.test_resume import Stop
 
 HORIZON, EDGE = 40, 0.85
 
@@ -95,16 +94,6 @@ class Said(Quiet):
         self.sentences.append(sentence)
 
 
-class StopsAt(Quiet):
-    """Says stop at a step."""
-
-    def __init__(self, step: int) -> None:
-        self.step = step
-
-    def advance(self, step: int, trainees: Sequence[Trainee]) -> None:
-        self.stop = step == self.step
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> list[Result]:
     """Two runs in which nothing breaks."""
@@ -165,7 +154,7 @@ def test_under_vmap_too_only_the_run_that_broke_stops_with_its_step_undone(
     assert_stopped(broken, 649, "RuntimeError: motor burnt", said)
     assert good.finished and good.step == 700
     break_it(monkeypatch, None)
-    _, stopped = train(config(), tmp_path / "stopped", seeds=2, watcher=StopsAt(649), lift="vmap")
+    _, stopped = train(config(), tmp_path / "stopped", seeds=2, watcher=Stop(649), lift="vmap")
     one, other = (unpack(run.path / "checkpoints" / "step-0000000649.npz") for run in (broken, stopped))
     compared = [name for name in one if name.startswith("run.agent")]
     assert len(compared) > 20

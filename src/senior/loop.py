@@ -87,7 +87,6 @@ class Training:
         self.watcher = watcher
         self.clock = Clock(trainees[0].progress.step)
         self.last = max(trainee.config.steps for trainee in trainees)
-        self.sent: list[int] = []  # runs whose environments were told to take a step
         self.waits = False  # wait for the device after each part, so that its time is that part's (senior bench)
 
     def train(self) -> None:
@@ -112,21 +111,26 @@ class Training:
                 )
                 if self.waits:
                     jax.block_until_ready([actions[i] for i in self.active()])
-            happened = None
             heard = {i for i in self.active() if step % LISTEN_EVERY == 0 and self.heard(i, step)}
-            if heard or any(plan.rare for plan in plans):
-                happened = self.take(actions, step)
+            rare = bool(heard) or any(plan.rare for plan in plans)
+            # under vmap environments live in workers, and step while the update is handed over
+            early = rare or (self.runs.lift == "vmap" and not self.waits)
+            happened = None
+            if early:
+                self.send(actions)
+            if rare:
+                happened = self.receive(step)
                 with self.clock.part("session"):
                     for i in self.active():
                         self.now_and_then(i, step, plans[i], i in heard)
-            elif self.runs.lift == "vmap" and not self.waits:
-                self.send(actions)  # environments in workers step while the update is handed over
             with self.clock.part("update"):
                 update = self.update(step, plans)
                 if self.waits:
                     self.wait(update)
+            if not early:
+                self.send(actions)
             if happened is None:
-                happened = self.receive(step) if self.sent else self.take(actions, step)
+                happened = self.receive(step)
             with self.clock.part("store"):
                 self.store(step, plans, happened, update)
                 if self.waits:
@@ -148,11 +152,6 @@ class Training:
 
     # Every step.
 
-    def take(self, actions: PerRun, step: int) -> list[Step | None]:
-        """Step the environments."""
-        self.send(actions)
-        return self.receive(step)
-
     def send(self, actions: PerRun) -> None:
         """Have the environments take a step."""
         with self.clock.part("act"):
@@ -162,14 +161,12 @@ class Training:
                 self.trainees[i].environment.send(action)
             for i in chosen:
                 self.trainees[i].environment.set_out()
-        self.sent = list(chosen)
 
     def receive(self, step: int) -> list[Step | None]:
         """What the step gave; a run whose environment breaks is saved as it was, and stopped."""
         happened: list[Step | None] = [None] * len(self.trainees)
-        sent, self.sent = self.sent, []
         with self.clock.part("environment"):
-            for i in sent:
+            for i in self.active():
                 result = self.trainees[i].environment.receive()
                 self.note(i, self.trainees[i].environment)
                 if isinstance(result, Failure):

@@ -105,7 +105,7 @@ class Recording:
         self.local.send(action)
 
     def set_out(self) -> None:
-        """See `Episodes.set_out`."""
+        """See `senior.envs.episodes.Episodes.set_out`; there is nobody else to do it."""
 
     def receive(self) -> Step | Failure:
         """See `senior.envs.episodes.Episodes.receive`. The scene that ends an episode is no frame."""
