@@ -36,7 +36,7 @@ def arm(place: str, strike: Callable[[], None], patch: Callable[[Any, str, Any],
         return path.name == "step-0000000650.npz"
 
     if place.isdigit():  # while the environment takes the action of that step
-        before(loop.Training, "take", lambda _self, _actions, step: step == int(place))
+        before(loop.Training, "receive", lambda _self, step: step == int(place))
     elif place == "checkpoint":  # half of that of step 650 is in its temporary file, its replay chunk is whole
         before(checkpoint, "write_atomically", halfway)
     elif place == "asked":  # the pairs of the second session are asked, none is answered
