@@ -17,12 +17,12 @@ import pytest
 import senior
 from senior import envs, judgement, program
 from senior.cli import COMMANDS, main
-from senior.cli.shared import BAD_INPUT, DONE, FAILED
+from senior.cli.shared import DONE, FAILED
 from senior.config import Answering, Config, to_json
 from senior.label.serving import Address
 from senior.methods import METHODS
 from senior.presets import preset, quick_changes, release
-from senior.types import BadInput
+from senior.types import BAD_INPUT, BadInput
 
 HERE = "tests.test_cli"
 

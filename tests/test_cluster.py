@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from senior.cli import main
-from senior.cli.shared import BAD_INPUT, DONE
+from senior.cli.shared import DONE
+from senior.types import BAD_INPUT
 from tests.cluster import Cluster, two_nodes
 from tests.equal import OPTIONS, assert_same_run
 from tests.test_sweep import worker_of

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from senior import bench, envs
+from senior import bench, envs, rundir
 from senior.checks import check
 from senior.config import SAC, Config, Queries, differences, from_json, load, to_json
 from senior.methods import METHODS, Method
 from senior.presets import PRESETS, preset, quick_changes
-from senior.types import BadInput
+from senior.types import BadInput, EnvSpec
 
 EVERYTHING = [
     (name, task, row)
@@ -156,3 +157,29 @@ def test_q_divides_k_and_n_only_where_they_exist():
     with pytest.raises(BadInput, match="must divide N, --outer-every 1500"):
         check(odd)
     check(replace(odd, method=METHODS["p-senior"]))  # no outer step, so there is no N
+
+
+def test_a_run_tells_the_commit_of_its_source_and_whether_it_was_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def git(*arguments: str) -> str:
+        names = ["-c", "user.name=somebody", "-c", "user.email=somebody@example.org"]
+        return subprocess.run(
+            ["git", *names, *arguments], cwd=tmp_path, check=True, capture_output=True, text=True
+        ).stdout.strip()
+
+    def told() -> str | None:
+        return rundir.protocol(EnvSpec("own", 4, 2, slice(0, 2), 10, None, False), "cpu")["git_commit"]
+
+    source = tmp_path / "src" / "senior" / "rundir.py"
+    monkeypatch.setattr(rundir, "__file__", str(source))
+    source.parent.mkdir(parents=True)
+    source.write_text("first")
+    assert told() is None
+    git("init")
+    git("add", ".")
+    git("commit", "--message", "first")
+    (tmp_path / "notes.txt").write_text("beside the source")
+    assert told() == git("rev-parse", "HEAD")
+    source.write_text("second")
+    assert told() == git("rev-parse", "HEAD") + "-changed"

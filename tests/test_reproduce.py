@@ -14,7 +14,7 @@ from scipy import stats
 
 from senior.checks import check
 from senior.cli import experiments, main
-from senior.cli.shared import BAD_INPUT, DONE, FAILED
+from senior.cli.shared import DONE, FAILED
 from senior.report.records import Run
 from senior.report.results import read
 from senior.reproduce import run as reproduce
@@ -34,6 +34,7 @@ from senior.reproduce.studies import (
 )
 from senior.reproduce.verdicts import judge_claim, judge_number
 from senior.schedule import plan
+from senior.types import BAD_INPUT
 from tests.many_runs import protocol, write_run
 from tests.small import small
 

@@ -29,9 +29,9 @@ from senior.label import server as served
 from senior.label.app import application
 from senior.label.desk import Desk
 from senior.label.guard import MOST_BYTES, Access, Guard
-from senior.label.serving import BAD_INPUT, SERVED, Address, Served
+from senior.label.serving import SERVED, Address, Served
 from senior.label.standing import Standing, trainer
-from senior.types import BadInput
+from senior.types import BAD_INPUT, BadInput
 from tests.siege import follow_description, kill_while_posting, throw_bytes
 from tests.stand_in import LOCAL, STUB, Client, Reply, Server, StandIn, new_id, raw, serving
 

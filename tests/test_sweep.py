@@ -21,7 +21,7 @@ import pytest
 from rich.console import Console
 
 from senior.cli import main
-from senior.cli.shared import BAD_INPUT, DONE, INTERRUPTED
+from senior.cli.shared import DONE, INTERRUPTED
 from senior.envs.point import Point
 from senior.rundir import HELD, RunDirectory, threads
 from senior.sweep.board import Board
@@ -31,7 +31,7 @@ from senior.sweep.local import LocalCrew
 from senior.sweep.run import run
 from senior.sweep.scheduler import RETRIES, Sweep
 from senior.sweep.worker import Watch, train
-from senior.types import BadInput
+from senior.types import BAD_INPUT, BadInput
 from tests.equal import OPTIONS, assert_same_run, short
 from tests.small import small
 

@@ -305,19 +305,20 @@ def _version(name: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The commit of the source tree this package runs from, if it is one."""
+    """The commit of the source tree this package runs from, if it is one; "-changed" where its files differ from it."""
     source = Path(__file__).resolve().parent
+    if source.parent.name != "src":
+        return None
     try:
-        shown = subprocess.run(
-            ["git", "-C", str(source), "rev-parse", "HEAD"],
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
+        changed = _git(source, "status", "--porcelain", "--", ".")
+        return _git(source, "rev-parse", "HEAD") + ("-changed" if changed else "")
     except (OSError, subprocess.SubprocessError):
         return None
-    return shown.stdout.strip() if source.parent.name == "src" else None
+
+
+def _git(place: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(place), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
 
 
 def _text(value: Any) -> str:

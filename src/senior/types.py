@@ -14,9 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+BAD_INPUT = 2
+"""Exit code of a process that ends with a `BadInput`."""
+
 
 class BadInput(Exception):
-    """Something the user gave cannot work. Its text is one clear sentence; the program ends with code 2."""
+    """Something the user gave cannot work. Its text is one clear sentence; the program ends with `BAD_INPUT`."""
 
     @classmethod
     def unknown(cls, kind: str, name: str, known: Iterable[str]) -> BadInput:

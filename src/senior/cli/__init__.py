@@ -6,8 +6,8 @@ import sys
 from collections.abc import Callable, Sequence
 
 from senior.cli import experiments, judge, lists, people, train
-from senior.cli.shared import BAD_INPUT, DONE, FAILED, INTERRUPTED
-from senior.types import BadInput
+from senior.cli.shared import DONE, FAILED, INTERRUPTED
+from senior.types import BAD_INPUT, BadInput
 
 COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
     "train": (train.train, "train one run, or several seeds in one program"),

@@ -10,8 +10,8 @@ import tyro
 from senior.label.serving import Address
 from senior.types import BadInput
 
-DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
-"""Exit codes."""
+DONE, FAILED, INTERRUPTED = 0, 1, 130
+"""Exit codes, beside `BAD_INPUT`."""
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,11 @@ from senior.config import Config, load
 from senior.label.app import application
 from senior.label.desk import Desk
 from senior.label.guard import MOST_BYTES, Access, is_loopback
-from senior.label.serving import BAD_INPUT, SERVED, Address, Served
+from senior.label.serving import SERVED, Address, Served
 from senior.label.standing import Standing
 from senior.preference_file import has_tables
 from senior.rundir import told
-from senior.types import BadInput
+from senior.types import BAD_INPUT, BadInput
 
 FIRST_PORT = 8642
 PLAIN = re.compile(r"[A-Za-z0-9._~-]*")

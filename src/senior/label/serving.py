@@ -17,11 +17,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from senior.extras import require
-from senior.types import BadInput
+from senior.types import BAD_INPUT, BadInput
 
 SERVED = 75
 """Exit code of a server whose run is served by another process already."""
-BAD_INPUT = 2
 NEEDED = ("fastapi", "jinja2", "uvicorn")
 
 

@@ -37,15 +37,13 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from senior.label.guard import SEALED, is_loopback
 from senior.rundir import is_run
-from senior.types import BadInput
+from senior.types import BAD_INPUT, BadInput
 
 LOOK_SECONDS = 2.0
 LEAST_SECONDS = 5.0
 """Between the end of one building and the beginning of the next."""
 REST = 3.0
 """And so many times as long as the last one took."""
-BAD_INPUT = 2
-"""How a building process ends that tells in a sentence why there is no page."""
 FILES = (
     "config.json",
     "eval.csv",
