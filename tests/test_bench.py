@@ -20,7 +20,7 @@ from tests.small import small
 @pytest.mark.parametrize("method", ["m-senior", "sac"])
 def test_a_method_is_measured(method: str, tmp_path: Path):
     config = small(method)
-    with Pools(1, "cpu", 2) as pools:
+    with Pools(1, "cpu") as pools:
         figures = bench.measure(config, 2, "cpu", 20, tmp_path, pools)
     learns = method != "sac"
     assert figures["runs"] == 2

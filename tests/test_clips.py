@@ -537,7 +537,7 @@ def test_clips_are_cut_from_what_was_filmed(tmp_path: Path):
 
     def record(first: int, steps: int) -> tuple[dict[int, list[Step]], dict[int, list[np.ndarray]]]:
         place = Local(lambda: envs.make(**made_by(config), render=True), config.seed, TRAINING)
-        recording = Recording(place, live, keep=2, segment=H)
+        recording = Recording(place, live, segment=H)
         assert recording.begin(first, afresh=True) is None
         episodes: dict[int, list[Step]] = {}
         scenes: dict[int, list[np.ndarray]] = {}
@@ -545,6 +545,7 @@ def test_clips_are_cut_from_what_was_filmed(tmp_path: Path):
             episode = place.episode
             scenes.setdefault(episode, []).append(place.env.render())  # pyright: ignore[reportArgumentType]
             episodes.setdefault(episode, []).append(acted(recording, episode, step))
+        recording.keep((1, 2))
         assert recording.notes == []
         place.env.close()  # and the rest as if it was killed
         return episodes, scenes
@@ -586,21 +587,22 @@ def test_clips_are_cut_from_what_was_filmed(tmp_path: Path):
     ]
 
 
-def test_films_are_kept_of_the_latest_episodes_that_pairs_are_cut_from(tmp_path: Path):
+def test_films_are_of_episodes_that_pairs_are_cut_from_and_go_when_they_are_told_to(tmp_path: Path):
     """Short ones are none of them."""
     place = Local(lambda: envs.make(**made_by(configuration(Forgetful)), render=True), 0, TRAINING)
-    recording = Recording(place, tmp_path, keep=2, segment=HORIZON)
+    recording = Recording(place, tmp_path, segment=HORIZON)
     recording.begin(0, afresh=True)
     acted(recording, 0, 0)
     recording.segment = H
     recording.begin(4)
-    for step in range(2 * HORIZON):
+    for step in range(3 * HORIZON):
         acted(recording, place.episode, step)
     recording.segment = HORIZON
     for step in range(3 * HORIZON):
         acted(recording, place.episode, step)
-    assert {path.name for path in tmp_path.glob("*.mp4")} == {"episode-4.mp4", "episode-5.mp4"}
-    recording.forget(5)  # goes on from a checkpoint before that one
+    assert {path.name for path in tmp_path.glob("*.mp4")} == {f"episode-{number}.mp4" for number in (4, 5, 6)}
+    recording.forget(6)  # goes on from a checkpoint before that one
+    recording.keep({4, 6})
     assert {path.name for path in tmp_path.glob("*.mp4")} == {"episode-4.mp4"}
     assert {path.name for path in tmp_path.glob("*.npy")} == {"episode-4.npy"}
     recording.close()
@@ -608,7 +610,7 @@ def test_films_are_kept_of_the_latest_episodes_that_pairs_are_cut_from(tmp_path:
 
 def test_a_run_goes_on_where_nothing_can_be_filmed(tmp_path: Path):
     place = Local(lambda: envs.make(**made_by(configuration(Blind)), render=True), 0, TRAINING)
-    recording = Recording(place, tmp_path, keep=2, segment=H)
+    recording = Recording(place, tmp_path, segment=H)
     assert recording.begin(0) is None
     for step in range(2 * HORIZON):
         acted(recording, 0, step)

@@ -76,6 +76,10 @@ def changed(*path: str, value: Any = 1) -> dict[str, Any]:
         (changed("sac", "tau", value=[0.1]), "tau"),
         (changed("mds", "axis", value="sideways"), "axis"),
         (changed("preset", value="quik"), "preset"),
+        (changed("seed", value=3.7), "seed"),
+        (changed("sac", "batch", value=True), "batch"),
+        (changed("sac", "discount", value="0.9"), "discount"),
+        (changed("asking", "wait", value="no"), "wait"),
     ],
 )
 def test_json_that_does_not_fit_is_refused_by_name(data: dict[str, Any], named: str):
@@ -88,6 +92,10 @@ def test_what_json_leaves_out_has_its_default():
     data = to_json(Config(seed=3, sac=SAC(batch=7)))
     del data["mds"], data["sac"]["tau"]
     assert from_json(data) == Config(seed=3, sac=SAC(batch=7))
+
+
+def test_a_whole_number_in_json_will_do_for_any_number():
+    assert from_json({"sac": {"discount": 1}}) == Config(sac=SAC(discount=1.0))
 
 
 def test_a_run_directory_gives_its_configuration_back(tmp_path: Path):

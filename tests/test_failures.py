@@ -144,6 +144,19 @@ def test_only_the_run_that_broke_stops_and_it_can_go_on(
     assert_same_run(mended.path, whole[1].path, interrupted=True)
 
 
+def test_a_run_that_breaks_at_its_first_step_leaves_no_checkpoint_and_says_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    break_it(monkeypatch, Fault("nan", 1, seed=0))
+    said = Said()
+    (broken,) = train(config(), tmp_path, watcher=said)
+    assert not broken.finished and saved_steps(broken.path / "checkpoints") == []
+    assert said.sentences[-1] == f"seed 0 is stopped at step 0: {broken.failure}"
+    break_it(monkeypatch, None)
+    (mended,) = resume(broken.path, said)
+    assert mended.finished
+
+
 def test_under_vmap_too_only_the_run_that_broke_stops_with_its_step_undone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

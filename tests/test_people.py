@@ -5,6 +5,7 @@ The person is a stand-in: a thread that writes answers as the labelling page doe
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -21,6 +22,7 @@ import numpy as np
 import pytest
 
 from senior.config import Asking, Config
+from senior.envs.recording import film_of
 from senior.files import unpack
 from senior.label.desk import Desk, Given, Side
 from senior.labels import export_labels
@@ -29,7 +31,7 @@ from senior.program import resume, train
 from senior.rundir import saved_steps
 from senior.types import BadInput
 from tests.equal import OPTIONS, assert_same_run, short
-from tests.small import rows
+from tests.small import rows, small
 from tests.test_resume import ROOT, Stop
 
 RULES = Rules()
@@ -262,6 +264,12 @@ def test_a_file_of_labels_teaches_what_its_run_was_taught(oracle: Path, tmp_path
         train(more, tmp_path / "more", watcher=Stop())
 
 
+def test_plain_sac_takes_a_file_of_labels_and_hears_nothing_of_it(tmp_path: Path):
+    config = small("sac", teacher=str(tmp_path / "labels.jsonl"))
+    (result,) = train(replace(config, steps=100), tmp_path / "out", watcher=Stop())
+    assert result.finished and not (result.path / "preferences.sqlite").exists()
+
+
 def test_what_makes_no_sense_with_people_is_refused(tmp_path: Path):
     for config, sentence in (
         (short("point", asking=Asking(overlap=2)), "--overlap 2 asks several people"),
@@ -336,11 +344,43 @@ def test_what_cannot_be_lived_through_again_is_filmed_and_shown(tmp_path: Path, 
 
     with pytest.raises(KeyboardInterrupt):
         train(config, run.parent, watcher=Looks())
+    unborn = run.parent / "unborn"
+    shutil.copytree(run, unborn)
     assert len(drawn) == 20 and all(name and failure is None for name, failure in drawn), drawn
     assert len(list((run / "label" / "live").glob("episode-*.mp4"))) == 12
     with person(run):
         (result,) = resume(run, Stop())
     assert result.finished and result.labels == 25
+
+    # one that is begun anew, for want of a checkpoint, films anew
+    shutil.rmtree(unborn / "checkpoints")
+    film = film_of(unborn / "label" / "live", 99)
+    film.write_bytes(b"of a life that is over")
+    resume(unborn, Stop(100))
+    assert not film.exists() and len(list(film.parent.glob("*.mp4"))) == 2
+
+
+def test_films_are_kept_while_people_are_asked_about_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Training goes on meanwhile, and its window of episodes with it."""
+    (tmp_path / "shaky_environment.py").write_text(SHAKY)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    config = replace(taught(wait=False), env="shaky_environment:Shaky", position="0:2", horizon=50)
+    config = replace(config, queries=replace(config.queries, episodes=3), steps=2000)
+    run = tmp_path / "out" / "seed-0"
+
+    class Looks(Stop):
+        def say(self, sentence: str) -> None:
+            if "at step 400" in sentence:
+                answer(run, 10)
+
+    (result,) = train(config, run.parent, watcher=Looks())
+    assert result.finished
+    with sqlite3.connect(run / "preferences.sqlite") as db:
+        asked = db.execute("SELECT episode_0, episode_1 FROM pairs WHERE collected_step IS NULL").fetchall()
+    db.close()
+    kept = {int(path.stem.removeprefix("episode-")) for path in (run / "label" / "live").glob("*.mp4")}
+    assert len(asked) == 10 and kept == {number for pair in asked for number in pair} | {37, 38, 39}
 
 
 def test_a_session_that_was_put_off_is_put_off_again(tmp_path: Path):

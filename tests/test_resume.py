@@ -278,11 +278,13 @@ def test_a_run_is_trained_by_one_process_at_a_time(reference: Path, tmp_path: Pa
     assert result.finished
 
 
-@pytest.mark.parametrize("moment", ["config.json", "tables"])
+@pytest.mark.parametrize("moment", ["directory", "config.json", "tables"])
 def test_killed_while_its_directory_is_made(moment: str, reference: Path, tmp_path: Path):
     """``config.json`` comes first, so there is nothing to resume, or a run that begins."""
     run = tmp_path / "seed-0"
     run.mkdir()
+    if moment == "config.json":
+        (run / "config.json.tmp").write_text('{"config": {"se')
     if moment == "tables":
         shutil.copy(reference / "seed-0" / "config.json", run)
         (result,) = resume(tmp_path)
@@ -319,6 +321,17 @@ def test_a_run_of_another_machine_goes_on_but_says_so(reference: Path, tmp_path:
     assert result.finished
     sentence, _ = watcher.said
     assert sentence.startswith("seed 0: threads and packages differ from when the run began, so it goes on but")
+
+
+def test_runs_of_another_device_than_the_first_are_left_to_be_resumed_by_themselves(reference: Path, tmp_path: Path):
+    shutil.copytree(reference, tmp_path, dirs_exist_ok=True)
+    other = tmp_path / "seed-1" / "config.json"
+    other.write_text(other.read_text().replace('"device": "cpu"', '"device": "gpu"', 1))
+    watcher = Stop()
+    left, first = resume(tmp_path, watcher)
+    assert first.finished and first.path == tmp_path / "seed-0"
+    assert left.failure == "It is computed on the GPU, and others here on the CPU; resume it by itself."
+    assert f"{tmp_path / 'seed-1'}: {left.failure}" in watcher.said
 
 
 class Moody(Point):

@@ -63,6 +63,19 @@ def treachery(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "order"
 
 
+def test_workers_are_started_when_they_are_needed():
+    pool = Workers(2)
+    try:
+        assert pool.workers == []
+        first = pool.next()
+        assert pool.workers == [first]
+        second = pool.next()
+        assert pool.next() is first is not second
+        assert first.fellows == second.fellows == [first, second]
+    finally:
+        pool.close()
+
+
 @pytest.fixture
 def pool(treachery: Path) -> Iterator[Workers]:
     """Two workers."""

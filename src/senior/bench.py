@@ -227,7 +227,7 @@ def run(
     )
     found = []
     for config, count in ((config, count) for config in configs for count in runs):
-        with tempfile.TemporaryDirectory() as folder, Pools(None, device, count) as pools:
+        with tempfile.TemporaryDirectory() as folder, Pools(None, device) as pools:
             figures = measure(config, count, device, steps, Path(folder), pools)
         found.append(figures)
         missing = float("nan")

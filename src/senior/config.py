@@ -357,11 +357,20 @@ def to_json(config: Config) -> dict[str, Any]:
 def from_json(data: dict[str, Any]) -> Config:
     """Read a configuration. `BadInput` for an unknown key or a value of the wrong type."""
     converter = cattrs.Converter(forbid_extra_keys=True)
+    for kind in (bool, int, float, str):
+        converter.register_structure_hook(kind, _exactly)
     try:
         return converter.structure(data, Config)
     except (cattrs.BaseValidationError, TypeError, ValueError) as error:
         reasons = "; ".join(cattrs.transform_error(error))
         raise BadInput(f"The configuration cannot be read: {reasons}.") from error
+
+
+def _exactly(value: Any, kind: type[Any]) -> Any:
+    """A value of that very type, where cattrs would make 3 of 3.7 and True of "no"; an int is a float too."""
+    if type(value) is not kind and (kind, type(value)) != (float, int):
+        raise TypeError(f"{value!r} is no {kind.__name__}")
+    return kind(value)
 
 
 def load(path: Path) -> Config:

@@ -34,7 +34,7 @@ def check_fit(config: Config, spec: EnvSpec) -> None:
             f"A segment of {config.queries.segment} steps does not fit into an episode of {spec.horizon}; "
             "lower --segment."
         )
-    if parts.is_recorded(config):
+    if config.method.learns_reward and parts.is_recorded(config):
         sizes = config.queries.segment, spec.observation_size, spec.action_size
         held = labels.pairs_in(Path(config.teacher), config.environment, sizes)
         if held < config.queries.budget:

@@ -356,7 +356,8 @@ class Training:
         trainee.failure = message
         if step > trainee.progress.step:
             trainee.save(self.runs[i], step)
-        self.watcher.say(f"{trainee.name} is stopped at step {step}, with a checkpoint: {message}")
+        kept = ", with a checkpoint" if step else ""
+        self.watcher.say(f"{trainee.name} is stopped at step {step}{kept}: {message}")
 
 
 def _fact(trainee: Trainee, happened: Step | None) -> Fact:

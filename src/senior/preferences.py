@@ -18,6 +18,7 @@ import numpy as np
 
 from senior.preference_file import (
     ANSWER,
+    OPEN,
     PAIR,
     SCHEMA,
     SCHEMA_VERSION,
@@ -169,6 +170,11 @@ class Preferences:
         """Numbers of those pairs of a session that answers are waited for."""
         chosen = asked_of(pairs_of(self._db, "session = ?", session), rules)
         return [pair.id for pair in chosen if not pair.complete(rules)]
+
+    def open_episodes(self) -> set[int]:
+        """Numbers of the episodes of all pairs whose session is not collected yet."""
+        rows = self._db.execute(f"SELECT episode_0, episode_1 FROM pairs WHERE {OPEN}")
+        return {episode for row in rows for episode in row}
 
     def query(self, ids: Sequence[int], reward_per_step: float) -> Query:
         """Asked pairs as they were put."""

@@ -75,8 +75,8 @@ def train_all(
 
     watcher: who is told of every step and of warnings, and can stop the runs, all saved; None prints warnings.
     lift: how runs share a program, ``loop`` or ``vmap``; None takes what suits the device.
-    workers: processes that the environments live in; 0: this one; None: as many as there are processors on a GPU,
-        but not more than runs, and 0 on a CPU.
+    workers: processes that the environments of a program live in, not more than it has runs; 0: this one; None: as
+        many as there are processors on a GPU, and 0 on a CPU.
     runs_per_device: how many are trained at a time; None: as many as the memory holds.
     page: where people, if they are the teacher, are asked; what each run's page is opened by is told to ``watcher``.
 
@@ -89,7 +89,7 @@ def train_all(
     _ready_for_people(configs)
     check_page(configs, page)
     watcher = watcher or Quiet()
-    with Pools(workers, device, len(runs)) as pools:
+    with Pools(workers, device) as pools:
         trainees: list[Trainee] = []
         try:
             for config, path in runs:
@@ -115,7 +115,7 @@ def continue_all(runs: Sequence[tuple[Config, Path]], watcher: Watcher) -> list[
     device = _check_runs(runs, None, None)
     _ready_for_people([config for config, _ in runs])
     results: dict[Path, Result] = {}
-    with Pools(None, device, len(runs)) as pools:
+    with Pools(None, device) as pools:
         waiting: list[Waiting] = []
         for config, path in runs:
             trainee = None
@@ -204,14 +204,15 @@ def resume(
     """Continue an interrupted run, or every run under a directory; those that are finished stay as they are.
 
     Runs of one shape that stand at the same step go on in one program. One that cannot go on is told, and the others
-    do. ``workers``, ``runs_per_device``, ``page``: see `train_all`. Raises `BadInput` if there is no run, or the only
-    one cannot go on.
+    do; so is one that is computed on another device than the first. ``workers``, ``runs_per_device``, ``page``: see
+    `train_all`. Raises `BadInput` if there is no run, or the only one cannot go on.
     """
     _check_machine(workers, runs_per_device)
     watcher = watcher or Quiet()
     found = find_runs(path)
     with ExitStack() as stack:
         pools: Pools | None = None
+        device = wanted = ""
         waiting: list[Waiting] = []
         results: list[Result] = []
         for directory in found:
@@ -219,9 +220,14 @@ def resume(
             try:
                 config = load(directory / "config.json")
                 _ready_for_people([config])
-                device = prepare_device(config.device)
                 if pools is None:
-                    pools = stack.enter_context(Pools(workers, device, len(found)))
+                    device, wanted = prepare_device(config.device), config.device
+                    pools = stack.enter_context(Pools(workers, device))
+                if config.device != wanted:
+                    raise BadInput(
+                        f"It is computed on the {config.device.upper()}, and others here on the {wanted.upper()}; "
+                        "resume it by itself."
+                    )
                 spec = spec_of(config)
                 learner = make_learner(config, spec)
                 trainee = Trainee(config, directory, learner, spec, pools.worker(learner))

@@ -97,9 +97,10 @@ class RunDirectory:
         return self.path / "label" / "live"
 
     def check_free(self) -> None:
-        """`BadInput` if there is something in its place."""
+        """`BadInput` if there is something in its place, beside what `create` leaves where it is killed."""
         with told(self.path):
-            taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
+            files = self.path.iterdir() if self.path.is_dir() else [self.path] if self.path.exists() else []
+            taken = any(file.name != "config.json.tmp" for file in files)
         if taken:
             raise BadInput(f"{self.path} exists and is not empty; choose another --out, or resume the run in it.")
 

@@ -45,9 +45,9 @@ class Result:
 class Pools:
     """Workers for the environments of each program: programs train in threads of their own, and share none."""
 
-    def __init__(self, count: int | None, device: str, runs: int) -> None:
-        """``count``: of each program's; None: what suits so many runs on that device."""
-        self.count = count_workers(device, runs) if count is None else count
+    def __init__(self, count: int | None, device: str) -> None:
+        """``count``: most workers of a program; None: what suits the device."""
+        self.count = count_workers(device) if count is None else count
         self._pools: dict[int, Workers] = {}
 
     def worker(self, learner: Learner) -> Worker | None:
@@ -66,9 +66,9 @@ class Pools:
             pool.close()
 
 
-def count_workers(device: str, runs: int) -> int:
-    """How many workers suit so many runs: on a CPU none, because the updates keep all processors busy."""
-    return min(rundir.threads(), runs) if device == "gpu" else 0
+def count_workers(device: str) -> int:
+    """How many workers suit a program: on a CPU none, because the updates keep all processors busy."""
+    return rundir.threads() if device == "gpu" else 0
 
 
 class Waiting(NamedTuple):
@@ -122,13 +122,13 @@ def train_waiting(
     alone: bool,
     page: Address,
 ) -> list[Result]:
-    """Train runs, as many at a time as there is room for.
+    """Train runs of one device, as many at a time as there is room for.
 
     alone: one that cannot be opened ends it all, for there is no other. page: where people, if they are the teacher,
     are asked.
     """
     results: dict[Path, Result] = {}
-    left = sorted(waiting, key=lambda run: run.trainee.config.device)
+    left = list(waiting)
     pages = ExitStack()
     try:
         check_page([trainee.config for trainee, _ in waiting], page)
@@ -138,10 +138,9 @@ def train_waiting(
                 trainee.tell("starting", standing.get("step", 0))
                 pages.enter_context(Serving(trainee.directory.path, page, watcher.say))
         while left and not (results and watcher.stop):
-            device = left[0].trainee.config.device
+            device = left[0].trainee.config.device  # that of all
             how = lift or lift_for(device)
-            alike = [run.trainee for run in left if run.trainee.config.device == device]
-            together = _together(alike, device, how, runs_per_device, watcher)
+            together = _together([run.trainee for run in left], device, how, runs_per_device, watcher)
             results |= _train_batch(left[:together], watcher, how, alone)
             left = left[together:]
         for trainee, _ in left:

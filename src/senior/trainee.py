@@ -100,7 +100,7 @@ class Trainee:
     def _film(self) -> Episodes:
         """The training environment, in this process, filmed."""
         local = Local(lambda: envs.make(**made_by(self.config), render=True), self.config.seed, TRAINING)
-        return Recording(local, self.directory.films, self.config.window, self.config.queries.segment)
+        return Recording(local, self.directory.films, self.config.queries.segment)
 
     @property
     def name(self) -> str:
@@ -135,7 +135,7 @@ class Trainee:
         """A new run in a directory made for it, whose environment stands at its first step (`reset`)."""
         self.directory.forget_everything()
         self._open_preferences()
-        if parts.is_recorded(self.config) and not self.preferences.session(0):
+        if self.rule and parts.is_recorded(self.config) and not self.preferences.session(0):
             labels.import_labels(Path(self.config.teacher), self.preferences, self.config.queries.per_session)
         return self.learner.init(self.config)
 
@@ -162,6 +162,8 @@ class Trainee:
         if found is None:
             if any(self.directory.checkpoints.glob("step-*.npz")):
                 raise BadInput(f"No checkpoint in {self.directory.path} can be read; the run cannot be resumed.")
+            if isinstance(self.environment, Recording):
+                self.environment.forget(0)
             self.reset(0)
             return self.begin()
         step, run, progress = found
@@ -290,6 +292,8 @@ class Trainee:
         if progress.elapsed > self.config.queries.segment:
             progress.recent.append([progress.episode, step + 1 - progress.elapsed, progress.elapsed])
             del progress.recent[: -self.config.window]
+            if isinstance(self.environment, Recording):  # clips may still be cut from what is asked about
+                self.environment.keep({row[0] for row in progress.recent} | self.preferences.open_episodes())
         progress.returns.append([progress.episode_return, progress.elapsed])
         del progress.returns[:-10]
         progress.episode += 1

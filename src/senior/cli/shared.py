@@ -19,8 +19,8 @@ class Machine:
     """How the runs of a command share this machine."""
 
     workers: int | Literal["auto"] = "auto"
-    """Processes that the environments live in; 0: this one.
-    auto: 0 on a CPU; on a GPU one per processor, but not more than runs."""
+    """Most processes that the environments of runs of one program live in; 0: this one.
+    auto: 0 on a CPU; on a GPU one per processor."""
     runs_per_device: int | Literal["auto"] = "auto"
     """How many runs are trained at a time, the others after them. auto: as many as the memory holds."""
 

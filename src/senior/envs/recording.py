@@ -7,7 +7,7 @@ seed and actions give another episode, what happened can only be seen when it ha
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -72,12 +72,11 @@ class Recording:
     MuJoCo draws only if `senior.envs.drawing.prepare_opengl` was called before it was imported (`senior.program`).
     """
 
-    def __init__(self, local: Local, folder: Path, keep: int, segment: int) -> None:
-        """``local``: made by ``make(..., render=True)``. ``keep``: of so many latest episodes the films are kept, those
-        not longer than ``segment`` steps left out: no pair is cut from them."""
+    def __init__(self, local: Local, folder: Path, segment: int) -> None:
+        """``local``: made by ``make(..., render=True)``. ``segment``: of episodes not longer than so many steps, from
+        which no pair is cut, there is no film."""
         self.local = local
         self.folder = folder
-        self.keep = keep
         self.segment = segment
         self.observation = local.observation
         self.notes = local.notes
@@ -95,6 +94,10 @@ class Recording:
         if afresh:
             self._put_away()
         return self._begun(self.local.begin(episode, afresh))
+
+    def keep(self, episodes: Container[int]) -> None:
+        """Throw away the films of all episodes but these."""
+        self._drop([number for number in self._kept() if number not in episodes])
 
     def forget(self, first: int) -> None:
         """Throw away the films from that episode on: the run goes on from before they were lived through."""
@@ -151,7 +154,7 @@ class Recording:
             self._tell(error)
 
     def _finish(self) -> None:
-        """Put the running film in its place, and throw away those that are older than the latest to be kept."""
+        """Put the running film in its place."""
         if self._film is None or len(self._observations) <= self.segment:
             self._discard()
             return
@@ -165,7 +168,6 @@ class Recording:
         except Exception as error:
             self._tell(error)
         self._discard()
-        self._drop(self._kept()[: -self.keep])
 
     def _kept(self) -> list[int]:
         """Numbers of the episodes of which there are films, in order."""

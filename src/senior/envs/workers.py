@@ -310,19 +310,23 @@ class Remote:
 
 
 class Workers:
-    """A fixed number of workers; environments are dealt out to them in turn."""
+    """Workers that environments are dealt out to in turn; each is started when it is dealt the first."""
 
     def __init__(self, count: int, patience: float = PATIENCE) -> None:
         if count < 1:
             raise BadInput(f"There must be at least one worker, not {count}.")
-        self.workers = [Worker(patience) for _ in range(count)]
-        for worker in self.workers:
-            worker.fellows = self.workers
-        self._next = itertools.cycle(self.workers)
+        self.workers: list[Worker] = []
+        self._turns = itertools.cycle(range(count))
+        self._patience = patience
 
     def next(self) -> Worker:
         """The worker whose turn it is."""
-        return next(self._next)
+        turn = next(self._turns)
+        if turn == len(self.workers):
+            worker = Worker(self._patience)
+            worker.fellows = self.workers
+            self.workers.append(worker)
+        return self.workers[turn]
 
     def close(self) -> None:
         """End all of them."""
