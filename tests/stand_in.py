@@ -25,7 +25,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from senior.config import Asking, Config, Queries, to_json
-from senior.label.serving import Address
+from senior.label.address import Address
 from senior.preference_file import connect
 from senior.preferences import Preferences
 from senior.presets import preset
@@ -227,8 +227,8 @@ def new_id() -> str:
 class Server:
     """The server of a run, as `senior.label.serving.Serving` starts it. What it complains of is kept."""
 
-    def __init__(self, run: Path, address: Address = LOCAL) -> None:
-        told = json.dumps({**asdict(address), "owner": "user"})
+    def __init__(self, run: Path, address: Address = LOCAL, owner: str = "user") -> None:
+        told = json.dumps({**asdict(address), "owner": owner})
         command = [sys.executable, "-m", "senior.label.server", str(run), told]
         self.process = subprocess.Popen(
             command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -264,9 +264,9 @@ class Server:
 
 
 @contextmanager
-def serving(run: Path, address: Address = LOCAL) -> Iterator[Server]:
+def serving(run: Path, address: Address = LOCAL, owner: str = "user") -> Iterator[Server]:
     """A server for a while; it must not have complained."""
-    server = Server(run, address)
+    server = Server(run, address, owner)
     try:
         yield server
     finally:

@@ -18,13 +18,13 @@ ROOT = Path(__file__).parents[1] / "src" / "senior"
 # A module may import from its own layer and those before it; what is not named here comes last.
 LAYERS = (
     {"types"},
-    {"agent", "reward", "replay", "preference_file", "preferences", "density", "files"},
+    {"agent", "reward", "replay", "preference_file", "preferences", "density", "files", "processes"},
     {"select", "explore", "teachers", "envs"},
     {"methods", "config", "checks", "presets"},
 )
 APART = {"select", "explore", "teachers", "envs"}
 # And all below.
-WITHOUT_JAX = {"types", "files", "preference_file", "preferences", "envs", "teachers", "rundir", "report"}
+WITHOUT_JAX = {"types", "files", "processes", "preference_file", "preferences", "envs", "teachers", "rundir", "report"}
 WITHOUT_JAX |= {"label", "label_file", "labels"}
 
 

@@ -19,7 +19,7 @@ from senior import envs, judgement, program
 from senior.cli import COMMANDS, main
 from senior.cli.shared import DONE, FAILED
 from senior.config import Answering, Config, to_json
-from senior.label.serving import Address
+from senior.label.address import Address
 from senior.methods import METHODS
 from senior.presets import preset, quick_changes, release
 from senior.types import BAD_INPUT, BadInput
@@ -81,6 +81,7 @@ NAMES = {
     "train --task point --teacher orakel": "'orakel'; did you mean oracle",
     "resume": "senior resume needs a PATH",
     "eval": "senior eval needs a PATH",
+    "labels export run": "senior labels export needs a --out",
     "eval run --vido film.mp4": "--vido; did you mean --video",
     "eval one two": "no use for 'two'",
     "tasks door": "no use for 'door'",

@@ -251,6 +251,11 @@ class Broken(Lift):
         raise OSError("no robot\nattached")
 
 
+class Exits(Lift):
+    def __init__(self) -> None:
+        sys.exit("no licence")
+
+
 class FailsAtOnce(Lift):
     def step(self, action: np.ndarray):
         raise OSError("cable")
@@ -309,6 +314,7 @@ def test_a_users_file_in_the_current_directory(tmp_path, monkeypatch):
         (f"{HERE}:DiscreteActions", "acts in Discrete.*bounded Box"),
         (f"{HERE}:Unbounded", "acts in Box.*bounded Box"),
         (f"{HERE}:Broken", "cannot be built: OSError: no robot attached"),
+        (f"{HERE}:Exits", "cannot be built: SystemExit: no licence"),
         (f"{HERE}:FailsAtOnce", "fails at its first step: OSError: cable"),
         ("Pendulum-v11", "did you mean Pendulum-v1"),
     ],
@@ -498,6 +504,8 @@ class Faulty(point.Point):
                     observation = observation[:3]
                 case "raise":
                     raise RuntimeError("motor\nburnt")
+                case "exit":
+                    sys.exit("window closed")
         return observation, reward, terminated, truncated, info
 
 
@@ -509,6 +517,7 @@ class Faulty(point.Point):
         ("reward", "the reward is inf"),
         ("shape", r"shape \(3,\) instead of \(4,\)"),
         ("raise", "RuntimeError: motor burnt"),
+        ("exit", "SystemExit: window closed"),
         ("reset", "ValueError: stuck"),
     ],
 )

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from senior import label_file
 from senior.config import Asking, Config
 from senior.files import pack, unpack
+from senior.label.desk import Desk
 from senior.label_file import read
 from senior.labels import describe, export_labels, import_into, import_labels, pairs_in, stats
 from senior.preference_file import ANSWER, PAIR, Rules, connect
@@ -231,6 +232,19 @@ def test_a_run_finds_its_sessions_asked_and_answered(run: Path, file: Path, tmp_
         assert [row["collected_step"] for row in preferences.asked()] == [500, 500, 600]
         # of another model's predictions none is told as the run's own
         assert preferences.judged(0) == [(None, 0.0), (None, None)]
+
+
+def test_imported_answers_are_nobodys_to_undo_here(run: Path, file: Path, tmp_path: Path):
+    """The episodes are another run's, so nobody could be shown their pairs again."""
+    other = made(tmp_path / "other", configured(budget=3, per_session=2))
+    with opened(other, 3) as preferences:
+        import_labels(file, preferences, per_session=2)
+    with closing(Desk(other / "preferences.sqlite", Rules())) as desk:
+        names = [who["name"] for who in desk.annotators()]
+        assert names
+        for name in names:
+            assert not desk.own(name)["undo"]
+            assert desk.undo(f"post of {name}", name).refused == "There is no answer of yours to undo."
 
 
 @pytest.mark.parametrize(

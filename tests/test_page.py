@@ -381,6 +381,71 @@ def test_playing(run: Lived, enter: Enter):
     assert ann.page.locator("video").count() == 2
 
 
+def test_keys_count_by_their_character_on_every_keyboard(run: Lived, enter: Enter):
+    """A French 1 needs Shift, a French or German bracket a third level, which is AltGr, Control and Alt, or Option."""
+    run.ask(1)
+    ann = enter()
+    ann.ready()
+
+    def press(key: str, **modifiers: bool) -> None:
+        ann.page.evaluate(
+            "told => document.body.dispatchEvent(new KeyboardEvent('keydown', {bubbles: true, ...told}))",
+            {"key": key, **modifiers},
+        )
+
+    def stands() -> tuple[str | None, ...]:
+        pressed = ("#pane-left", "#rate-one", "#rate-two")
+        return tuple(name for name in pressed if ann.attribute(name, "aria-pressed") == "true")
+
+    press("1", altKey=True)  # Firefox's first tab on Linux
+    press("]", altKey=True)
+    press("=", ctrlKey=True)
+    assert stands() == ("#rate-one",)
+    press("1", shiftKey=True)
+    press("]", ctrlKey=True, altKey=True)
+    assert stands() == ("#pane-left", "#rate-two")
+    press("[", altKey=True, modifierAltGraph=True)
+    assert stands() == ("#pane-left", "#rate-one")
+    press("?", shiftKey=True)
+    ann.wait("#help[open]")
+    press("?")
+    ann.wait("#help:not([open])")
+    press("=", shiftKey=True)
+    ann.wait_for_text("status", "Saved: about equal")
+
+
+def test_nobody_is_given_a_name(browser: Browser, house: tuple[Lived, str]):
+    """Or two people might be one."""
+    somebody = Person(browser, "")
+    somebody.page.goto(house[1])
+    somebody.wait("#name:focus")
+    assert somebody.page.input_value("#name") == ""
+    somebody.page.keyboard.press("Enter")
+    somebody.wait("#start[open]")
+    assert somebody.attribute("body", "data-state") == "start"
+    somebody.leave()
+
+
+def test_a_tab_of_another_run_is_loaded_anew_and_answers_nothing_there(browser: Browser, tmp_path: Path):
+    address = replace(LOCAL, token="")
+    with lived(tmp_path / "first") as first, lived(tmp_path / "second") as second:
+        first.ask(1)
+        second.ask(2)
+        with serving(first.path, address) as server:
+            ann = Person(browser, "ann").open(server.url)
+            ann.ready()
+        ann.page.keyboard.press("ArrowLeft")
+        ann.wait_for_text("unsaved", "Not saved, trying again")
+        with serving(second.path, replace(address, port=ann_port(server))):
+            ann.wait("body[data-state=ready]")
+            ann.wait_for_text("session", "0 of 2")
+            assert first.answers() == second.answers() == []
+            assert ann.press("ArrowLeft").startswith("Saved")
+            assert len(second.answers()) == 1
+            ann.forgive("Failed to load resource")
+            ann.leave()
+
+
 def test_two_people_never_get_the_same_pair(run: Lived, enter: Enter):
     ids = run.ask(10)
     rng = random.Random(1)
@@ -602,7 +667,7 @@ def test_the_overview_shows_who_said_what_and_how_far_they_agree(browser: Browse
             assert [row.split("\t") for row in cells] == [["ann, bob", "5", "0.62"]]
             people = [row.split("\t") for row in person.page.locator("#annotators tbody tr").all_inner_texts()]
             median = {
-                name: sorted(row.seconds or 0 for row in run.answers() if row.annotator == name)[3] for name in said
+                name: np.median([row.seconds or 0 for row in run.answers() if row.annotator == name]) for name in said
             }
             assert people == [
                 ["ann", "6", "0", "1", f"{median['ann']:.1f} s"],

@@ -24,6 +24,7 @@ import pytest
 from senior.config import Asking, Config
 from senior.envs.recording import film_of
 from senior.files import unpack
+from senior.label.address import Address
 from senior.label.desk import Desk, Given, Side
 from senior.labels import export_labels
 from senior.preference_file import Rules, asked_of, connect, has_tables, pairs_of
@@ -280,6 +281,13 @@ def test_what_makes_no_sense_with_people_is_refused(tmp_path: Path):
         if sentence:
             with pytest.raises(BadInput, match=sentence):
                 train(config, tmp_path / "refused", watcher=Stop())
+    for address, sentence in (
+        (Address(host="0.0.0.0", token=""), "Without a token the page can only be served to this machine"),
+        (Address(token="a b"), "can stand in a token"),
+        (Address(host="192.0.2.1"), "Cannot listen on 192.0.2.1"),
+    ):
+        with pytest.raises(BadInput, match=sentence):
+            train(taught(), tmp_path / "refused", watcher=Stop(), page=address)
     assert not (tmp_path / "refused").exists()
 
 

@@ -7,6 +7,7 @@ import csv
 import io
 import json
 import math
+import os
 import re
 import sqlite3
 from contextlib import closing
@@ -221,6 +222,8 @@ BROKEN = {
     "no object": ("config.json", b'{"config": 3, "protocol": {}}', "config.json is damaged"),
     "no method": ("config.json", b'{"config": {"seed": 0, "steps": 9}, "protocol": {}}', "config.json is damaged"),
     "no text": ("config.json", b"\xff\xfe", "config.json is damaged"),
+    "no end of steps": ("config.json", b'{"config": {"seed": 0, "steps": Infinity}, "protocol": {}}', "is damaged"),
+    "no end of depth": ("config.json", 100_000 * b"[", "config.json is damaged"),
     "no evaluations": ("eval.csv", None, "eval.csv is missing"),
     "nothing": ("eval.csv", b"", "eval.csv is empty"),
     "head only": ("eval.csv", HEAD, "not evaluated yet"),
@@ -247,6 +250,23 @@ def test_a_broken_run_is_named_and_the_others_are_read(tmp_path: Path, kind: str
     found = read([tmp_path])
     assert [run.seed for run in found.runs] == [1]
     assert reason in reasons(found)["run-0"]
+
+
+def test_runs_that_were_not_evaluated_until_half_cost_the_page_of_no_others(tmp_path: Path):
+    late = replace(config(), steps=2_400_000)
+    path = write_run(tmp_path / "late", late, files=())
+    (path / "eval.csv").write_bytes(HEAD + b"1200000,9,9,10,0.5,1,1\n2400000,9,9,10,1,1,1\n")
+    evaluated(tmp_path / "other", config(method="mrn"), [0, 0, 0, 1])
+    page = report([tmp_path], tmp_path / "out").page.read_text()
+    assert "mrn" in page
+
+
+def test_a_name_that_is_no_text_costs_no_page(tmp_path: Path):
+    evaluated(tmp_path / "run", config(), [0, 0, 0, 1])
+    broken = Path(os.fsdecode(bytes(tmp_path) + b"/caf\xe9"))
+    broken.mkdir()
+    (broken / "config.json").write_text("{")
+    assert r"caf\udce9" in report([tmp_path], tmp_path / "out").page.read_text()
 
 
 def test_a_folder_in_a_file_s_place_is_named(tmp_path: Path):
@@ -369,6 +389,14 @@ def test_a_clock_that_began_anew_is_known_by_the_rate_it_does_not_fit(tmp_path: 
     head = "step,seconds,steps_per_second\n10000,165,60.6060606\n"  # killed after it; what follows began anew there
     (path / "timing.csv").write_text(f"{head}20000,170,58.8235294\n30000,340,58.8235294\n40000,510,58.8235294\n")
     assert read([tmp_path]).runs[0].seconds == pytest.approx(165 + 510)
+
+
+def test_steps_between_the_last_row_and_a_stop_count_at_the_rate_they_go_on_with(tmp_path: Path):
+    """At 50 steps a second throughout; stopped and saved at 9,900."""
+    path = write_run(tmp_path / "run", config(), files=CSV_FILES)
+    rows = "5000,100,50\n10000,2,50\n15000,102,50\n40000,602,50\n"
+    (path / "timing.csv").write_text(f"step,seconds,steps_per_second\n{rows}")
+    assert read([tmp_path]).runs[0].seconds == pytest.approx(40_000 / 50)
 
 
 def train_csv(path: Path, lines: list[str]) -> None:
@@ -494,6 +522,14 @@ def test_a_page_of_something_else_is_not_overwritten(tmp_path: Path):
     page = write([Section("Runs", ("m-senior --select uniform & others",))], tmp_path, "first")
     assert '<span class="option">--select</span> uniform &amp; others' in page.read_text()
     assert "<h1>second</h1>" in write([], tmp_path, "second").read_text()
+    own = tmp_path / "tables" / "own.csv"
+    own.write_text("somebody's")
+    tables = [Table("Kept", ("a",), [["1"]], name) for name in ("kept", "left")]
+    write([Section("Two", (), tuple(tables))], tmp_path, "two")
+    write([Section("One", (), tuple(tables[:1]))], tmp_path, "one")
+    names = {path.name for path in own.parent.iterdir()}
+    assert names == {"own.csv", "kept.csv", "kept.tex"}  # what the page before had made is gone
+    write([], tmp_path, "none")
     page.write_text("<h1>my own</h1>")
     with pytest.raises(BadInput, match=r"index\.html is no page of a report, and would be overwritten"):
         write([], tmp_path, "third")

@@ -213,6 +213,8 @@ def test_only_the_studys_own_runs_count_and_only_those_of_one_protocol(tmp_path:
     told = reproduce.write(studies, "quick", tmp_path)
     line = next(line for line in told.splitlines() if line.startswith("  mrn "))
     assert "3 seeds" in line and "reproduced" not in line
+    fewer = reproduce.write(studies, "quick", tmp_path, seeds=2)
+    assert "2 seeds" in next(line for line in fewer.splitlines() if line.startswith("  mrn "))
     assert "Left out on demand: window-close, handle-press, window-open, door-open, door-unlock." in told
     page = (tmp_path / "report" / "index.html").read_text()
     assert "arXiv 2506.14648" in page and "can be refuted here, and not confirmed" in page

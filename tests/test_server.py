@@ -6,6 +6,7 @@ import asyncio
 import csv
 import json
 import os
+import signal
 import socket
 import threading
 import time
@@ -16,6 +17,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from http.client import HTTPConnection
 from pathlib import Path
+from queue import Queue
 from typing import Any
 
 import pytest
@@ -26,10 +28,11 @@ from starlette.types import Message, Receive, Scope, Send
 from senior import methods
 from senior.config import to_json
 from senior.label import server as served
+from senior.label.address import Address
 from senior.label.app import application
 from senior.label.desk import Desk
 from senior.label.guard import MOST_BYTES, Access, Guard
-from senior.label.serving import SERVED, Address, Served
+from senior.label.serving import SERVED, Served, Serving
 from senior.label.standing import Standing, trainer
 from senior.types import BAD_INPUT, BadInput
 from tests.siege import follow_description, kill_while_posting, throw_bytes
@@ -244,6 +247,7 @@ def test_every_answer_has_the_headers_that_keep_a_browser_safe(client: Client, c
         404: [client.get("/nothing"), client.get("/static/nothing"), client.get("/clips/nothing.mp4")],
         405: [client.send("DELETE", "/"), client.get("/api/next")],
         409: [client.post("/api/undo", {"post": new_id(), "annotator": "nobody"})],
+        410: [client.post("/api/next", {"annotator": "nobody", "run": "another"})],
         413: [client.post("/api/goal", {"goal": MOST_BYTES * "x"})],
         416: [client.get(clip, range="bytes=99999999-")],
         422: [client.post("/api/next", {})],
@@ -690,6 +694,54 @@ def test_a_run_has_one_server_and_only_its_owner_can_read_the_token(fresh: Stand
         assert again.url == server.url  # a page that is open finds it
 
 
+@pytest.mark.parametrize(
+    ("owner", "wanted", "left"),
+    [
+        ("user", Address(token="wanted"), True),
+        ("trainer", Address(), True),
+        ("trainer", Address(token="wanted"), False),
+        ("trainer", Address(allowed_hosts=("robot",)), False),
+    ],
+)
+def test_a_server_that_is_there_is_left_but_not_a_trainer_s_at_another_address(
+    fresh: StandIn, owner: str, wanted: Address, left: bool
+):
+    fresh.ask(1)
+    told: Queue[str] = Queue()
+    with serving(fresh.path, owner=owner) as server:
+        with Serving(fresh.path, wanted, told.put):
+            said = told.get(timeout=30).removeprefix("Answer in a browser: ")
+            if left:
+                assert said == server.url and server.process.poll() is None
+            else:
+                assert server.process.wait(30) in (0, -signal.SIGTERM)
+                assert wanted.token is None or said.endswith(f"?token={wanted.token}")
+                with Client(said) as client:
+                    assert client.next("ann")["pair"]["pair"] == 1
+        if owner == "trainer":
+            assert server.process.wait(30) in (0, -signal.SIGTERM)
+        else:
+            assert server.process.poll() is None
+
+
+def test_what_is_meant_for_another_run_changes_nothing(run: StandIn, client: Client):
+    (pair,) = run.ask(1)
+    state = client.next("ann")["state"]
+    identity, goal = state["identity"], state["goal"]
+    sent = {"annotator": "ann", "run": "another"}
+    for path, more in {
+        "/api/next": {},
+        "/api/answer": {"post": new_id(), "pair": pair, "answer": "left"},
+        "/api/undo": {"post": new_id()},
+        "/api/redo": {"post": new_id()},
+    }.items():
+        assert_refused(client.post(path, sent | more), 410, "Another run is served here now.")
+    assert_refused(client.post("/api/goal", {"goal": "Close it", "run": "another"}), 410)
+    assert client.get("/api/state").data["goal"] == goal
+    assert client.answer("ann", pair, "left", run=identity).status == 200
+    assert f'data-run="{identity}"' in client.get("/").body.decode()
+
+
 def test_a_server_waits_until_there_is_something_to_serve(tmp_path: Path):
     with StandIn(tmp_path / "run") as run:
         run.ask(1)
@@ -717,7 +769,7 @@ def test_what_cannot_be_served_is_told_in_a_sentence(fresh: StandIn, tmp_path: P
     assert "not a run directory" in refused(tmp_path / "nothing")
     for token in ("a b", "a;b", "ключ", "a&b", 'a"b', "a\nb"):
         assert "can stand in a token" in refused(fresh.path, Address(token=token))
-    assert "Cannot listen on 192.0.2.1, port 8642: " in refused(fresh.path, Address(host="192.0.2.1"))
+    assert "Cannot listen on 192.0.2.1: " in refused(fresh.path, Address(host="192.0.2.1"))
     (fresh.path / "label" / "clips").rmdir()
     (fresh.path / "label" / "clips").write_text("in the way")
     assert "a file where a directory should be" in refused(fresh.path)
@@ -775,7 +827,11 @@ def test_where_a_run_was_is_not_forgotten_when_it_cannot_be_served(fresh: StandI
     before = Served("127.0.0.1", 9, "kept", 1, "user")
     (fresh.path / "label").mkdir(exist_ok=True)
     before.write(fresh.path)
-    assert "Cannot listen" in refused(fresh.path, Address(host="192.0.2.1", token="other"))
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert f"port {port}: Address already in use" in refused(fresh.path, Address(port=port, token="other"))
     assert Served.find(fresh.path) == before
     assert not (fresh.path / "label" / "token").exists()
 

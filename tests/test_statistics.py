@@ -113,8 +113,15 @@ def test_estimates_over_tasks_are_rliable_s():
     matrix = np.stack(even, axis=1)
     assert found["even"].mean == pytest.approx([metrics.aggregate_iqm(matrix)])
     assert mean["even"].mean == pytest.approx([metrics.aggregate_mean(matrix)])
-    assert found["uneven"].mean == pytest.approx([stats.trim_mean(np.concatenate(uneven), 0.25)])
+    copied = [np.repeat(task, 60 // len(task)) for task in uneven]  # every task weighs the same
+    assert found["uneven"].mean == pytest.approx([stats.trim_mean(np.concatenate(copied), 0.25)])
     assert mean["uneven"].mean == pytest.approx([np.mean([task.mean() for task in uneven])])
+
+
+def test_an_arm_is_no_better_for_having_more_runs_of_an_easy_task():
+    easy, hard = np.ones, np.zeros
+    found = interquartile_means({"one": [easy(8), hard(2)], "other": [easy(2), hard(8)]})
+    assert found["one"].first().mean == found["other"].first().mean == pytest.approx(0.5)
 
 
 def test_intervals_are_those_of_rliable_s_bootstrap():

@@ -477,6 +477,24 @@ def test_a_worker_that_died_idle_costs_no_cell_a_try(tmp_path: Path):
     crew.close()
 
 
+def test_a_worker_that_was_told_to_stop_by_somebody_else_is_given_nothing_more(tmp_path: Path):
+    crew = LocalCrew("cpu", 1, tmp_path / "logs")
+    cell = Cell(short(device="cpu"), tmp_path / "run")
+
+    def outcomes() -> tuple[Outcome, ...]:
+        until = time.monotonic() + 300
+        while not (done := crew.wait(0.5)):
+            assert time.monotonic() < until
+        return done[0].outcomes
+
+    crew.give((cell,))
+    os.kill(worker_of(cell.path, 10), signal.SIGTERM)
+    assert outcomes() == (Outcome(False, None),)
+    crew.give((cell,))
+    assert outcomes() == (Outcome(True, None),)
+    crew.close()
+
+
 class Forking(Point):
     """A point with a helper, which outlives it for two minutes."""
 

@@ -317,6 +317,12 @@ def test_a_report_that_fails_is_told_and_the_next_one_is_tried(
         assert kept == replace(fine, trouble="The report failed: ValueError: <b>no")
         kept_folders = [folder.name for folder in tmp_path.glob("senior-watch-*/*")]
         assert fine.folder is not None and fine.folder.name in kept_folders
+        flag.touch()
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "executable", str(tmp_path / "nowhere"))  # as where there is no room for a process
+            grow(run, 30_001)
+            until(builder, lambda shown: "FileNotFoundError" in shown.trouble)
+        until(builder, lambda shown: not shown.trouble)
     assert "ValueError: <b>no" in capfd.readouterr().err
 
 

@@ -19,6 +19,7 @@ class Episode(NamedTuple):
     total: float  # true return
     success: float | None  # 1 if any step succeeded; None if the environment does not tell
     actions: np.ndarray  # [T, a] float32
+    observations: np.ndarray  # [T, o] float32, after each action
 
 
 class _Judging:
@@ -36,7 +37,7 @@ class _Judging:
         return self.failure is None and bool(self.left)
 
     def _begin(self) -> None:
-        self.total, self.success, self.actions = 0.0, None, []
+        self.total, self.success, self.actions, self.observations = 0.0, None, [], []
         if self.left:
             self.failure = self.place.begin(self.left[0])
 
@@ -47,11 +48,13 @@ class _Judging:
             self.failure = step
             return
         self.actions.append(action)
+        self.observations.append(step.next_observation)
         self.total += step.reward
         if step.success is not None:
             self.success = max(self.success or 0.0, step.success)
         if step.ended:
-            self.judged.append(Episode(self.total, self.success, np.stack(self.actions)))
+            lived = np.stack(self.actions), np.stack(self.observations)
+            self.judged.append(Episode(self.total, self.success, *lived))
             del self.left[0]
             self._begin()
 

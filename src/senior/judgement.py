@@ -11,7 +11,7 @@ import numpy as np
 
 from senior import evaluate, rundir
 from senior.agent.networks import MLP
-from senior.config import Config, load
+from senior.config import load
 from senior.envs import render
 from senior.envs.episodes import AFTERWARDS, Failure, Local, episode_seed
 from senior.files import Damaged, unpack
@@ -64,7 +64,9 @@ def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None 
     summary = evaluate.summary(judged)
     reason = None
     if video is not None:
-        reason = film(config, AFTERWARDS, 0, judged[0].actions, Path(video))
+        seed = episode_seed(config.seed, AFTERWARDS, 0)
+        lived = judged[0].actions, judged[0].observations
+        reason = render.record(render.Request(seed, *lived, **made_by(config)), Path(video))
     return Judgement(
         episodes,
         summary["success_rate"],
@@ -99,10 +101,3 @@ def load_policy(path: Path) -> tuple[int, MLP]:
         return int(saved["step"]), actor
     except (Damaged, KeyError) as error:
         raise BadInput(f"The policy of {path} cannot be read: {error}.") from error
-
-
-def film(config: Config, purpose: int, episode: int, actions: np.ndarray, out: Path) -> str | None:
-    """Write an episode as MP4 by living through it again; None, or the sentence why there is no video."""
-    seed = episode_seed(config.seed, purpose, episode)
-    request = render.Request(**made_by(config), seed=seed, actions=actions)
-    return render.record(request, out)

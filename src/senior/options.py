@@ -66,7 +66,7 @@ def _one_sentence(box: str) -> str:
         return str(BadInput.unknown(found[2], found[1], re.findall(r"'([^']*)'", found[3])))
     if found := re.search(r"Missing value for argument '(\S+)'", text):
         return f"{found[1]} needs a value."
-    if found := re.search(r"Missing from (senior \w+): (\S+)", text):
+    if found := re.search(r"Missing from (senior [\w ]+): (\S+)", text):
         return f"{found[1]} needs a {found[2]}; see {found[1]} --help."
     if found := re.search(r"Error parsing (\S+):.*(literal for int|to float).*?: ('.*?')", text):
         kind = "a whole number" if found[2] == "literal for int" else "a number"

@@ -74,7 +74,10 @@ CREATE TABLE clips (
     failure TEXT,                               -- why not, in a sentence
     PRIMARY KEY (pair, side)
 );
-CREATE TABLE notes (name TEXT PRIMARY KEY, value TEXT NOT NULL);  -- goal: the sentence that people are shown
+CREATE TABLE notes (                            -- goal: what people are shown; identity: of the run;
+    name  TEXT PRIMARY KEY,                     -- imported: the last pair of those that came from a file
+    value TEXT NOT NULL
+);
 CREATE TABLE shape (steps INTEGER, observation INTEGER, action INTEGER);  -- of every segment: H, o, a
 """
 

@@ -150,6 +150,8 @@ class Preferences:
                 f"INSERT INTO answers (pair, {', '.join(ANSWER)}) VALUES (?{', ?' * len(ANSWER)})",
                 [[answer[name] for name in ("pair", *ANSWER)] for answer in answers],
             )
+            last = max(pair["id"] for pair in pairs)
+            self._db.execute("INSERT INTO notes VALUES ('imported', ?)", (str(last),))
 
     def foretold(self, session: int) -> bool:
         """Whether what the model predicted of all its pairs is recorded."""

@@ -12,7 +12,8 @@ from senior import parts, rundir
 from senior.config import Config, load
 from senior.envs.drawing import NoVideo, prepare_opengl
 from senior.fit import check_fit, check_offered, spec_of
-from senior.label.serving import Address, check_installed
+from senior.label.address import Address
+from senior.label.serving import check_installed
 from senior.learner import Learner
 from senior.loop import Watcher
 from senior.runs import Lift, prepare_device

@@ -251,7 +251,7 @@ def is_run(path: Path) -> bool:
         content = json.loads((path / "config.json").read_bytes())
     except FileNotFoundError:
         return False
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return True
     return isinstance(content, dict) and {"config", "protocol"} <= content.keys()
 

@@ -16,7 +16,8 @@ import numpy as np
 from senior import checkpoint, rundir
 from senior.config import Config
 from senior.envs.workers import Worker, Workers
-from senior.label.serving import Address, Serving
+from senior.label.address import Address, check_address
+from senior.label.serving import Serving
 from senior.learner import Learner, Run
 from senior.loop import Training, Watcher
 from senior.report.curves import learning_curve
@@ -108,8 +109,10 @@ class _Together:
 
 
 def check_page(configs: Sequence[Config], page: Address) -> None:
-    """`BadInput` for a fixed port where several runs have a page."""
+    """`BadInput` for a page that cannot be served there, or for a fixed port where several runs have one."""
     asking = sum(config.teacher == "human" for config in configs)
+    if asking:
+        check_address(page)
     if asking > 1 and page.port:
         raise BadInput(f"--port {page.port} is for one page, and each of {asking} runs has its own; leave it out.")
 

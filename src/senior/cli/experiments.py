@@ -121,7 +121,8 @@ class ReproduceOptions:
     tasks: tuple[str, ...] = ()
     """Only these of the studies' tasks (docs/experiments.md). Left out: all."""
     seeds: int | None = None
-    """How many seeds, from 0 on. Left out: 5, with --scale quick 8, with smoke 2."""
+    """How many seeds, from 0 on, are trained and judged.
+    Left out: 5, with --scale quick 8, with smoke 2 are trained, and all that are there judged."""
     out: Path | None = None
     """Directory that takes runs and report. Left out: runs/reproduce-senior-SCALE."""
     jobs: int | None = None
@@ -155,7 +156,7 @@ def reproduce(arguments: list[str]) -> int:
     if code == INTERRUPTED:
         return code
     try:
-        print(run.write(studies, options.scale, out))
+        print(run.write(studies, options.scale, out, options.seeds))
     except BadInput as error:
         if code == DONE:
             raise

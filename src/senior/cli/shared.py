@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import tyro
 
-from senior.label.serving import Address
+from senior.label.address import Address
 from senior.types import BadInput
 
 DONE, FAILED, INTERRUPTED = 0, 1, 130

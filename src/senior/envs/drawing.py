@@ -29,7 +29,7 @@ INSTALL = (
 )
 NO_OPENGL = f"no OpenGL library was found; {INSTALL}"
 BACKENDS = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
-USUAL_FPS = 30  # where an environment does not tell its own
+USUAL_FPS = Fraction(30)  # where an environment does not tell its own
 CLIP_SIDE = 384  # pixels of a Meta-World frame that people compare; 14 ms each on one core (256: 10 ms, 480: 18 ms)
 KEYFRAMES = 10  # frames from one that a player can begin at to the next, in films that are stepped through
 
@@ -99,9 +99,13 @@ def drawable(
     return make(task, env, position, length_scale, horizon, render=True)[0]
 
 
-def own_fps(env: gymnasium.Env[Any, Any]) -> int:
-    """Steps per second of an environment's own time."""
-    return int(env.metadata.get("render_fps") or USUAL_FPS)
+def own_fps(env: gymnasium.Env[Any, Any]) -> Fraction:
+    """Steps per second of an environment's own time; the usual number where it tells none that makes sense."""
+    try:
+        told = Fraction(float(env.metadata["render_fps"])).limit_denominator(1000)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        told = Fraction(0)
+    return told if told > 0 else USUAL_FPS
 
 
 class Camera(Protocol):

@@ -102,7 +102,7 @@ def _constructor(name: str) -> Callable[..., Any]:
         sys.path.append(os.getcwd())
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise BadInput(f"The module of --env {name} cannot be imported: {_told(error)}") from error
     if attribute in gymnasium.registry:
         return _registered(attribute)
@@ -133,7 +133,7 @@ def _started(name: str, construct: Callable[..., Any], render: bool) -> gymnasiu
                 env = construct()
         else:
             env = construct()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise BadInput(f"The environment {name} cannot be built: {_told(error)}") from error
     if not isinstance(env, gymnasium.Env):
         raise BadInput(f"--env {name} gives a {type(env).__name__}, not a Gymnasium environment.")
@@ -190,11 +190,11 @@ def _probe(name: str, construct: Callable[..., Any]) -> dict[str, Any]:
         env.reset(seed=0)
         middle = (env.action_space.low + env.action_space.high) / 2  # pyright: ignore[reportAttributeAccessIssue]
         return env.step(middle.astype(env.action_space.dtype))[4]
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise BadInput(f"The environment {name} fails at its first step: {_told(error)}") from error
     finally:
         env.close()
 
 
-def _told(error: Exception) -> str:
+def _told(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")

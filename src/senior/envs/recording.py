@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Container
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +136,7 @@ class Recording:
                 if self._camera is None:
                     self._camera = camera(self.local.env, CLIP_SIDE)
                 out = film_of(self.folder, self.local.episode)
-                self._film = Film(out, Fraction(own_fps(self.local.env)), KEYFRAMES)
+                self._film = Film(out, own_fps(self.local.env), KEYFRAMES)
             except Exception as error:
                 self._tell(error)
             self._shoot()

@@ -12,7 +12,6 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ import gymnasium
 import numpy as np
 
 from senior.envs.drawing import Film, NoVideo, camera, drawable, own_fps
+from senior.processes import importing_alike
 from senior.types import BadInput
 
 SIDE = 480  # pixels of a Meta-World frame
@@ -29,11 +29,13 @@ NO_VIDEO = 3  # exit code
 
 @dataclass(frozen=True)
 class Request:
-    """One episode to be drawn: the arguments of `senior.envs.make`, its seed, its actions float32 [T, a]."""
+    """One episode to be drawn: its seed, its actions and what was observed after each, and the arguments of
+    `senior.envs.make`."""
 
-    task: str | None
     seed: int
-    actions: np.ndarray
+    actions: np.ndarray  # float32 [T, a]
+    observations: np.ndarray  # float32 [T, o]
+    task: str | None = None
     env: str | None = None
     position: str | None = None
     length_scale: float | None = None
@@ -49,13 +51,14 @@ class Request:
             "horizon": self.horizon,
         }
         with path.open("wb") as file:
-            np.savez(file, environment=np.array(json.dumps(given)), seed=self.seed, actions=self.actions)
+            lived = {"seed": self.seed, "actions": self.actions, "observations": self.observations}
+            np.savez(file, environment=np.array(json.dumps(given)), **lived)
 
     @classmethod
     def read(cls, path: Path) -> Request:
         with np.load(path, allow_pickle=False) as file:
             given = json.loads(str(file["environment"]))
-            return cls(seed=int(file["seed"]), actions=file["actions"].astype(np.float32), **given)
+            return cls(int(file["seed"]), file["actions"], file["observations"], **given)
 
 
 def record(request: Request, out: Path, seconds: float = 600) -> str | None:
@@ -68,7 +71,9 @@ def record(request: Request, out: Path, seconds: float = 600) -> str | None:
         request.write(asked)
         command = [sys.executable, "-m", "senior.envs.render", str(asked), str(out)]
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
+            done = subprocess.run(
+                command, env=importing_alike(), capture_output=True, text=True, timeout=seconds, check=False
+            )
         except subprocess.TimeoutExpired:
             return f"There is no video because drawing it took more than {seconds:g} seconds."
     if done.returncode == 0:
@@ -80,13 +85,21 @@ def record(request: Request, out: Path, seconds: float = 600) -> str | None:
 
 
 def _frames(env: gymnasium.Env[Any, Any], request: Request, stride: int) -> Iterator[np.ndarray]:
-    """Every ``stride``-th frame of the episode, the first and the last included."""
+    """Every ``stride``-th frame of the episode, the first and the last included.
+
+    Raises `NoVideo` where it is not the episode that was lived through.
+    """
     env.reset(seed=request.seed)
     eye = camera(env, SIDE)
     try:
         yield eye.frame()
-        for number, action in enumerate(request.actions, start=1):
-            _, _, terminated, truncated, _ = env.step(action)
+        for number, (action, seen) in enumerate(zip(request.actions, request.observations, strict=True), start=1):
+            observation, _, terminated, truncated, _ = env.step(action)
+            if not np.array_equal(np.asarray(observation, np.float32), seen):
+                raise NoVideo(
+                    "the environment does not repeat an episode from its seed and actions; its reset must honour the "
+                    "seed it is given."
+                )
             ended = terminated or truncated or number == len(request.actions)
             if number % stride == 0 or ended:
                 yield eye.frame()
@@ -105,7 +118,7 @@ def draw(request: Request, out: Path) -> None:
     fps = own_fps(env)
     stride = max(1, round(fps / MOST_FPS))
     try:
-        with Film(out, Fraction(fps, stride)) as film:
+        with Film(out, fps / stride) as film:
             for frame in _frames(env, request, stride):
                 film.add(frame)
     finally:

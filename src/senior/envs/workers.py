@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from senior.envs.episodes import Failure, Step
+from senior.processes import importing_alike
 from senior.types import BadInput, EnvSpec
 
 PATIENCE = 120.0
@@ -78,13 +79,11 @@ class Worker:
             os.fdopen(our_orders, "wb", buffering=0),
             os.fdopen(our_answers, "rb", buffering=0),
         )
-        # what is importable here is importable there
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         command = [sys.executable, "-m", "senior.envs.worker", str(orders), str(answers)]
         self.process = subprocess.Popen(
             command,
             pass_fds=(orders, answers),
-            env=environment,
+            env=importing_alike(),
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # an interrupt is for the process that gives orders
         )

@@ -34,7 +34,10 @@ Post = Annotated[str, StringConstraints(pattern=r"^[0-9A-Za-z-]{8,64}$")]
 
 
 class _Sent(BaseModel):
+    """``run``: identity of the run that is meant, as the state tells it; left out: the one that is served."""
+
     model_config = ConfigDict(extra="forbid")
+    run: str | None = None
 
 
 class NextPair(_Sent):
@@ -86,7 +89,9 @@ def application(run: Standing, access: Access, clips: bool = True, over: Callabl
     templates = Environment(loader=FileSystemLoader(PAGE), autoescape=True)
 
     def rendered(name: str) -> HTMLResponse:
-        response = HTMLResponse(templates.get_template(name).render(run=run.title, goal=run.goal))
+        response = HTMLResponse(
+            templates.get_template(name).render(run=run.title, identity=run.desk.identity(), goal=run.goal)
+        )
         if access.token:
             response.set_cookie(access.cookie, access.token, httponly=True, samesite="strict", max_age=30 * 24 * 3600)
         return response
@@ -133,34 +138,44 @@ def application(run: Standing, access: Access, clips: bool = True, over: Callabl
         headers = {"cache-control": "private, max-age=31536000, immutable"}
         return FileResponse(file, media_type="video/mp4", headers=headers)
 
-    @app.post("/api/next", responses=_told(422))
+    def check_meant(sent: _Sent) -> None:
+        """Another run may be served where a page's own was."""
+        if sent.run not in (None, run.desk.identity()):
+            raise HTTPException(410, "Another run is served here now.")
+
+    @app.post("/api/next", responses=_told(410, 422))
     def next_pair(sent: NextPair) -> dict[str, Any]:
         """The pair to look at now, kept for two minutes, and the ones after it."""
+        check_meant(sent)
         return run.turn(sent.annotator)
 
     def turned(annotator: str, outcome: Outcome) -> Any:
         turn = run.turn(annotator, outcome.said)
         return JSONResponse({"detail": outcome.refused, "turn": turn}, 409) if outcome.refused else turn
 
-    @app.post("/api/answer", responses=_told(409, 422))
+    @app.post("/api/answer", responses=_told(409, 410, 422))
     def answer(sent: Answered) -> Any:
         """Save an answer: it is on the disk when this is answered. Then the next pair."""
+        check_meant(sent)
         given = Given(sent.pair, sent.answer, sent.strength, sent.seconds, sent.replays)
         return turned(sent.annotator, run.desk.answer(sent.post, sent.annotator, given))
 
-    @app.post("/api/undo", responses=_told(409, 422))
+    @app.post("/api/undo", responses=_told(409, 410, 422))
     def undo(sent: Back) -> Any:
         """Take back one's latest answer that is not trained on; its pair comes again."""
+        check_meant(sent)
         return turned(sent.annotator, run.desk.undo(sent.post, sent.annotator))
 
-    @app.post("/api/redo", responses=_told(409, 422))
+    @app.post("/api/redo", responses=_told(409, 410, 422))
     def redo(sent: Back) -> Any:
         """Give again the answer that was taken back last."""
+        check_meant(sent)
         return turned(sent.annotator, run.desk.redo(sent.post, sent.annotator))
 
-    @app.post("/api/goal", responses=_told(422))
+    @app.post("/api/goal", responses=_told(410, 422))
     def goal(sent: Goal) -> dict[str, Any]:
         """Say anew what the robot is to do."""
+        check_meant(sent)
         run.desk.write("goal", sent.goal)
         return run.state(None)
 

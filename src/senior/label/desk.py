@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable, Sequence
 from itertools import islice, pairwise
 from pathlib import Path
+from secrets import token_hex
+from statistics import median
 from threading import Lock
 from typing import Any, Literal, NamedTuple
 
@@ -67,6 +69,7 @@ class Desk:
         self._clock = clock
         self._db = connect(path)
         self._lock = Lock()
+        self._identity = ""
 
     def close(self) -> None:
         """Close the file."""
@@ -163,10 +166,14 @@ class Desk:
         return pair
 
     def _latest(self, annotator: str, condition: str, order: str) -> tuple[int, int, dict[str, Any]] | None:
-        """Number, pair and content of one's latest answer that meets a condition."""
+        """Number, pair and content of one's latest answer that meets a condition.
+
+        Imported ones are left out: their episodes are another run's, so nobody could be shown the pair again.
+        """
+        here = "pair > COALESCE((SELECT CAST(value AS INTEGER) FROM notes WHERE name = 'imported'), 0)"
         row = self._db.execute(
             "SELECT id, pair, answer, strength, shown_left FROM answers "
-            f"WHERE annotator = ? AND {condition} ORDER BY {order} DESC LIMIT 1",
+            f"WHERE annotator = ? AND {condition} AND {here} ORDER BY {order} DESC LIMIT 1",
             (annotator,),
         ).fetchone()
         if row is None:
@@ -313,14 +320,14 @@ class Desk:
         told = []
         for name in dict.fromkeys(row[0] for row in rows):
             answers = [(answer, seconds) for who, answer, seconds in rows if who == name]
-            times = sorted(seconds for _, seconds in answers if seconds is not None)
+            times = [seconds for _, seconds in answers if seconds is not None]
             told.append(
                 {
                     "name": name,
                     "answers": len(answers),
                     "skips": sum(answer is None for answer, _ in answers),
                     "equals": sum(answer == Preferred.EQUAL for answer, _ in answers),
-                    "median_seconds": times[len(times) // 2] if times else None,
+                    "median_seconds": median(times) if times else None,
                 }
             )
         return told
@@ -349,6 +356,14 @@ class Desk:
         """Write a note; it is on the disk when this returns."""
         with self._lock, transaction(self._db):
             self._db.execute("INSERT OR REPLACE INTO notes VALUES (?, ?)", (name, value))
+
+    def identity(self) -> str:
+        """What tells this run from all others, made up when it is first asked for."""
+        if not self._identity:
+            with self._lock, transaction(self._db):
+                self._db.execute("INSERT OR IGNORE INTO notes VALUES ('identity', ?)", (token_hex(8),))
+            self._identity = self.note("identity") or ""
+        return self._identity
 
     def clip(self, name: str) -> bool:
         """Whether there is a clip of that name."""

@@ -8,6 +8,8 @@ import threading
 import time
 from pathlib import Path
 
+from senior.processes import importing_alike
+
 
 class Drawing:
     """The clip process, started anew whenever it dies. It ends when its standard input does."""
@@ -31,7 +33,7 @@ class Drawing:
         while not self._over.is_set():
             began = time.monotonic()
             command = [sys.executable, "-m", "senior.label.clips", str(self.run)]
-            self._process = subprocess.Popen(command, stdin=subprocess.PIPE)
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, env=importing_alike())
             if self._over.is_set():
                 self._process.terminate()
             self._process.wait()

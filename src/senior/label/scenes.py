@@ -62,7 +62,7 @@ class Stage:
     @property
     def fps(self) -> Fraction:
         """Steps per second of the environment's own time."""
-        return Fraction(own_fps(self.open()[0]))
+        return own_fps(self.open()[0])
 
     def scenes(self, segment: Segment) -> Iterator[np.ndarray]:
         """The frames [h, w, 3] uint8 of a segment. Raises `Unlike`, `NoVideo`, and whatever an environment raises."""

@@ -11,7 +11,6 @@ import errno
 import fcntl
 import json
 import os
-import re
 import secrets
 import socket
 import sys
@@ -22,18 +21,17 @@ from pathlib import Path
 import uvicorn
 
 from senior.config import Config, load
+from senior.label.address import PLAIN, Address, check_address, is_loopback, listening_at, shown_host
 from senior.label.app import application
 from senior.label.desk import Desk
-from senior.label.guard import MOST_BYTES, Access, is_loopback
-from senior.label.serving import SERVED, Address, Served
+from senior.label.guard import MOST_BYTES, Access
+from senior.label.serving import SERVED, Served
 from senior.label.standing import Standing
 from senior.preference_file import has_tables
 from senior.rundir import told
 from senior.types import BAD_INPUT, BadInput
 
 FIRST_PORT = 8642
-PLAIN = re.compile(r"[A-Za-z0-9._~-]*")
-"""Tokens that stand in an address and in a cookie as they are."""
 
 
 def standing_of(run: Path, config: Config) -> Standing:
@@ -65,18 +63,11 @@ def _token(folder: Path, wanted: str | None) -> str:
 
 def _bind(address: Address, before: int | None) -> socket.socket:
     """A listening socket: on the wanted port, else on that of the run's last server, else on the first that is free."""
-    family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
     ports = [address.port] if address.port else [*([before] if before else []), *range(FIRST_PORT, FIRST_PORT + 50), 0]
     for port in ports:
-        # the protocol is told: else asyncio leaves Nagle's algorithm on, which costs 40 ms for every answer
-        listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listening.bind((address.host, port))
-            listening.listen(128)
-            return listening
+            return listening_at(address.host, port)
         except OSError as error:
-            listening.close()
             if address.port or error.errno != errno.EADDRINUSE:
                 raise BadInput(f"Cannot listen on {address.host}, port {port}: {error.strerror or error}.") from error
     raise BadInput(f"No port is free on {address.host}.")
@@ -90,10 +81,7 @@ def serve(run: Path, address: Address, owner: str) -> Served:
         raise BadInput(f"The run in {run} is answered by {config.teacher}, not by people (--teacher human).")
     if not config.method.learns_reward:
         raise BadInput(f"The run in {run} learns from the true reward; nobody is asked anything.")
-    if address.token and not PLAIN.fullmatch(address.token):
-        raise BadInput("Only letters from A to Z, digits and . _ ~ - can stand in a token.")
-    if address.token == "" and not is_loopback(address.host):
-        raise BadInput(f"Without a token the page can only be served to this machine, not on {address.host}.")
+    check_address(address)
     with told(folder):
         (folder / "clips").mkdir(parents=True, exist_ok=True)
         lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
@@ -124,7 +112,7 @@ def _serve_alone(run: Path, config: Config, address: Address, owner: str) -> Ser
             before.write(run)
         raise
     token, port = _token(folder, address.token), listening.getsockname()[1]
-    served = Served(_shown_host(address.host), port, token, os.getpid(), owner)
+    served = Served(shown_host(address.host), port, token, os.getpid(), owner, address.allowed_hosts)
     served.write(run)
     print(served.url, flush=True)
     access = access_to(address, port, token)
@@ -139,13 +127,6 @@ def _serve_alone(run: Path, config: Config, address: Address, owner: str) -> Ser
     server = uvicorn.Server(serving)
     server.run(sockets=[listening])
     return served
-
-
-def _shown_host(host: str) -> str:
-    """The host as it stands in an address that others can open."""
-    if host in ("0.0.0.0", "::"):
-        return socket.gethostname()
-    return f"[{host}]" if ":" in host else host
 
 
 def main(arguments: list[str]) -> int:

@@ -13,29 +13,18 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from senior.extras import require
+from senior.label.address import Address, shown_host
+from senior.processes import importing_alike
 from senior.types import BAD_INPUT, BadInput
 
 SERVED = 75
 """Exit code of a server whose run is served by another process already."""
 NEEDED = ("fastapi", "jinja2", "uvicorn")
-
-
-@dataclass(frozen=True)
-class Address:
-    """Where a page is to be served."""
-
-    host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 lets other machines in, with the token of the printed address."""
-    port: int = 0
-    """0: where the run was served before, else the first free one from 8642 on."""
-    allowed_hosts: tuple[str, ...] = ()
-    """Further names that browsers may know this machine by."""
-    token: str | None = None
-    """None: the run's own. Empty: everybody on this machine may."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +37,19 @@ class Served:
     process: int
     owner: str
     """trainer or user: who started the server, and ends it."""
+    allowed_hosts: tuple[str, ...] = ()
+    """As in `Address`."""
 
     @property
     def url(self) -> str:
         """What to open in a browser."""
         return f"http://{self.host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+
+    def is_at(self, wanted: Address) -> bool:
+        """Whether that is where it is."""
+        port, token = wanted.port or self.port, self.token if wanted.token is None else wanted.token
+        where = shown_host(wanted.host), port, token, wanted.allowed_hosts
+        return where == (self.host, self.port, self.token, self.allowed_hosts)
 
     def write(self, run: Path) -> None:
         """Write it down, for its owner's eyes only."""
@@ -66,7 +63,8 @@ class Served:
     def find(cls, run: Path) -> Served | None:
         """The server that serves or last served a run."""
         try:
-            return cls(**json.loads((run / "label" / "server.json").read_text()))
+            told = json.loads((run / "label" / "server.json").read_text())
+            return cls(**{**told, "allowed_hosts": tuple(told.get("allowed_hosts", ()))})
         except (OSError, ValueError, TypeError):
             return None
 
@@ -89,7 +87,8 @@ class Serving:
     """Keeps a run served while it is trained: starts the server, and again whenever it dies.
 
     A server that is there already, because the trainer was killed and the server was not, or because the user started
-    one, is left to serve. ``say`` is told the address, once.
+    one, is left to serve; but the trainer's is ended where it is not at the address that is wanted now. ``say`` is told
+    the address, once.
     """
 
     def __init__(self, run: Path, address: Address, say: Callable[[str], None]) -> None:
@@ -131,6 +130,7 @@ class Serving:
             with open(folder / "server.log", "w+") as log:
                 self._process = subprocess.Popen(
                     command,
+                    env=importing_alike(),
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.PIPE,
                     stderr=log,
@@ -149,9 +149,7 @@ class Serving:
             if self._over.is_set():
                 return
             if self._process.returncode == SERVED:
-                self._tell(Served.read(self.run).url)
-                while _serves(self.run) and not self._over.wait(0.5):
-                    pass
+                self._leave_to_serve(Served.read(self.run))
             elif self._process.returncode == BAD_INPUT:
                 self._say(f"The labelling page is not served: {complaint} Serve it with: senior label {self.run}")
                 return
@@ -160,6 +158,16 @@ class Serving:
                     self._say(f"The labelling page's server ended and is started again: {complaint}")
                     complained = complaint
                 self._over.wait(0.5)
+
+    def _leave_to_serve(self, other: Served) -> None:
+        """Until another server ends, or this object does."""
+        if other.owner == "trainer" and not other.is_at(self._address):
+            with suppress(ProcessLookupError):
+                os.kill(other.process, signal.SIGTERM)
+        else:
+            self._tell(other.url)
+        while _serves(self.run) and not self._over.wait(0.5):
+            pass
 
     def _tell(self, url: str) -> None:
         if url != self._told:

@@ -43,6 +43,7 @@ class Standing:
         people = [{"name": who["name"], "answers": who["answers"]} for who in self.desk.annotators()]
         told = {
             "run": self.title,
+            "identity": self.desk.identity(),
             "goal": self.goal,
             **progress,
             "trainer": doing,

@@ -37,11 +37,12 @@ def mean_of(values: Sequence[float] | np.ndarray) -> float:
 
 
 def interval_of_mean(runs: Sequence[Run], step: int) -> Interval | None:
-    """Student's, of success at that step; None where no success is told."""
-    if runs[0].evaluation.success is None:
+    """Student's, of success at that step; None where no success is told, or no run was evaluated until then."""
+    scores = scores_at(runs, step)
+    if runs[0].evaluation.success is None or not len(scores):
         return None
     episodes = min(int(run.evaluation.episodes[-1]) for run in runs)
-    return mean_interval(list(scores_at(runs, step)), episodes)
+    return mean_interval(list(scores), episodes)
 
 
 def single(found: Mapping[str, Intervals]) -> dict[str, Interval]:

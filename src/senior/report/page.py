@@ -28,6 +28,10 @@ from senior.types import BadInput
 
 GENERATOR = "senior report"
 """What is told in the head of every page to have made it."""
+LINK = re.compile(r'href="((?:figures|tables)/[^"/]+)"')
+"""Files beside a page."""
+UNENCODED = "backslashreplace"
+"""How names of directories are written that are not text."""
 LARGEST_SVG = 400_000
 """Bytes of a drawing above which the page shows its PNG instead."""
 DOTS = 150
@@ -80,11 +84,13 @@ def write(sections: Iterable[Section], out: Path, title: str) -> Path:
     sections are made one by one, memory for the largest of them is enough. Names are made safe for files and, where two
     are the same, told apart by a number.
 
-    Raises `BadInput` if ``out`` cannot be written, or holds a page of something else.
+    Files that an earlier page there links and this one does not are removed. Raises `BadInput` if ``out`` cannot be
+    written, or holds a page of something else.
     """
     template, page = _template(), out / "index.html"
     try:
-        if page.exists() and f'content="{GENERATOR}"'.encode() not in page.read_bytes()[:1000]:
+        before = page.read_text(errors="replace") if page.exists() else None
+        if before is not None and f'content="{GENERATOR}"' not in before[:1000]:
             raise BadInput(f"{page} is no page of a report, and would be overwritten; choose another directory.")
         for folder in ("figures", "tables"):
             (out / folder).mkdir(parents=True, exist_ok=True)
@@ -93,7 +99,10 @@ def write(sections: Iterable[Section], out: Path, title: str) -> Path:
             parts.append(_written(section, out, names))
             del section
             gc.collect()  # figures hold on to themselves
-        write_atomically(page, template.render(title=title, generator=GENERATOR, sections=parts).encode())
+        written = template.render(title=title, generator=GENERATOR, sections=parts)
+        write_atomically(page, written.encode(errors=UNENCODED))
+        for link in set(LINK.findall(before or "")) - set(LINK.findall(written)):
+            (out / link).unlink(missing_ok=True)
     except OSError as error:
         raise BadInput(f"The report cannot be written into {out}: {error.strerror or error}.") from error
     return page
@@ -137,7 +146,7 @@ def _write_drawing(drawing: Drawing, out: Path, names: _Names) -> dict[str, Any]
     drawing.figure.clear()
     _beside(place, ".svg").write_bytes(svg.getvalue())
     _beside(place, ".png").write_bytes(png.getvalue())
-    _beside(place, ".csv").write_text(to_csv(drawing.rows))
+    _beside(place, ".csv").write_text(to_csv(drawing.rows), errors=UNENCODED)
     vector = len(svg.getvalue()) <= LARGEST_SVG
     kind, data = ("svg+xml", _adapted(svg.getvalue())) if vector else ("png", png.getvalue())
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
@@ -161,8 +170,8 @@ def _adapted(svg: bytes) -> bytes:
 def _write_table(table: Table, section: str, out: Path, names: _Names) -> dict[str, Any]:
     name = names.free("table", table.name or section)
     place = out / "tables" / name
-    _beside(place, ".csv").write_text(to_csv([table.head, *table.rows]))
-    _beside(place, ".tex").write_text(latex(table.caption, table.head, table.rows))
+    _beside(place, ".csv").write_text(to_csv([table.head, *table.rows]), errors=UNENCODED)
+    _beside(place, ".tex").write_text(latex(table.caption, table.head, table.rows), errors=UNENCODED)
     return {
         "name": name,
         "caption": table.caption,

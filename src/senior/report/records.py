@@ -159,7 +159,7 @@ def read_run(path: Path, known: dict[str, Config | None], left_out: list[LeftOut
         fingerprint = _fingerprint(given if config is None else to_json(normal(config)), protocol)
     except OSError as error:
         raise Unusable(f"config.json cannot be read: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise Unusable(f"config.json is damaged: {error}") from error
     arm = Arm(task, method if config is None else label(config), fingerprint)
     evaluation = _evaluations(path / "eval.csv")
@@ -295,7 +295,7 @@ def preferences_in(path: Path) -> Iterator[sqlite3.Connection]:
             if version != SCHEMA_VERSION:
                 raise Unusable(f"{path.name} has schema version {version}; this program reads {SCHEMA_VERSION}")
             yield db
-    except (sqlite3.Error, ValueError, TypeError) as error:
+    except (sqlite3.Error, ValueError, TypeError, AttributeError) as error:
         raise Unusable(f"{path.name} is damaged: {error}") from error
 
 
@@ -337,7 +337,10 @@ def _episodes(path: Path) -> Episodes:
 
 
 def _seconds(path: Path, until: float = math.inf) -> float:
-    """The clock begins anew with every process that goes on with the run, and then does not fit the rate."""
+    """The clock begins anew with every process that goes on with the run, and then does not fit the rate.
+
+    What the process before it took after its last row is not told; such steps count at the rate of the new one.
+    """
     told = columns(path, ("step", "seconds"), ("steps_per_second",))
     told = {name: column[told["step"] <= until] for name, column in told.items()}
     clock = told["seconds"]
@@ -345,4 +348,4 @@ def _seconds(path: Path, until: float = math.inf) -> float:
         raise Unusable(f"{path.name} tells no time")
     gone, expected = np.diff(clock, prepend=0.0), np.diff(told["step"], prepend=0.0) / told["steps_per_second"]
     went_on = np.where(np.isnan(expected), gone >= 0, np.isclose(gone, expected, rtol=1e-3))
-    return float(np.where(went_on, gone, clock).sum())
+    return float(np.where(went_on, gone, np.where(np.isfinite(expected), expected, clock)).sum())

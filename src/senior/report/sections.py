@@ -117,7 +117,8 @@ def _summary(marks: tuple[int, int], tasks: Tasks) -> Table:
     rows: list[list[Cell]] = []
     for task, arms in tasks.items():
         ended = {label: done for label, runs in arms.items() if (done := finished(runs))}
-        middle = interquartile_means({label: [scores_at(runs, marks[1])] for label, runs in ended.items()})
+        last = {label: scores_at(runs, marks[1]) for label, runs in ended.items()}
+        middle = interquartile_means({label: [scores] for label, scores in last.items() if len(scores)})
         by_steps, by_asked = (
             means({label: [np.array([area(run) for run in runs])] for label, runs in ended.items()})
             for area in (_area_by_steps, _area_by_labels)
@@ -129,7 +130,7 @@ def _summary(marks: tuple[int, int], tasks: Tasks) -> Table:
                 rows.append([*cells, *[None] * 6])
                 continue
             cells.append(bracketed(interval_of_mean(done, marks[1])))
-            cells += estimate_and_interval(middle[label])
+            cells += estimate_and_interval(middle[label]) if label in middle else (None, None)
             cells += [with_interval(areas[label]) for areas in (by_steps, by_asked)]
             cells.append(span([float(run.evaluation.labels[-1]) for run in done]))
             rows.append(cells)

@@ -148,7 +148,7 @@ def interquartile_mean(values: np.ndarray) -> np.ndarray:
 def interquartile_means(scores: Mapping[str, Scores]) -> dict[str, Intervals]:
     """Per method, the interquartile mean over all runs of all tasks; points are what a run's score has of them.
 
-    A task counts by its runs.
+    Every task weighs the same: where it has fewer runs than another, each of them weighs more.
     """
     return _estimates({name: (own,) for name, own in scores.items()}, _interquartile)
 
@@ -189,7 +189,14 @@ Blocks = Sequence[np.ndarray]
 
 
 def _interquartile(blocks: Blocks) -> np.ndarray:
-    return interquartile_mean(np.concatenate([block.reshape(-1, *block.shape[2:]) for block in blocks]))
+    values = np.concatenate([block.reshape(-1, *block.shape[2:]) for block in blocks])
+    if len(blocks) == 1:
+        return interquartile_mean(values)
+    weights = np.concatenate([np.full(len(block), 1 / (len(block) * len(blocks))) for block in blocks])
+    order = np.argsort(values, axis=0)
+    end = np.cumsum(weights[order], axis=0)
+    middle = np.minimum(end, 0.75) - np.maximum(end - weights[order], 0.25)  # of what a run weighs, in order
+    return 2 * (np.take_along_axis(values, order, axis=0) * np.maximum(middle, 0)).sum(axis=0)
 
 
 def _mean(blocks: Blocks) -> np.ndarray:

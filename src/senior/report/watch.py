@@ -35,7 +35,8 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainT
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from senior.label.guard import SEALED, is_loopback
+from senior.label.address import is_loopback
+from senior.label.guard import SEALED
 from senior.rundir import is_run
 from senior.types import BAD_INPUT, BadInput
 
@@ -134,11 +135,15 @@ class Builder:
     def _keep(self) -> None:
         known, rest = None, 0.0
         while not self._over.is_set():
-            now = fingerprint(self.places)
-            if now != known and rest <= 0:
-                known, began = now, time.monotonic()
-                self._build()
-                rest = max(self._least, REST * (time.monotonic() - began))
+            began = time.monotonic()
+            try:
+                now = fingerprint(self.places)
+                if now != known and rest <= 0:
+                    self._build()
+                    known, rest = now, max(self._least, REST * (time.monotonic() - began))
+            except Exception as error:  # no memory for a process, and whatever else may pass
+                self._tell(f"The report failed: {type(error).__name__}: {error}")
+                rest = self._least
             pause = LOOK_SECONDS if rest <= 0 else min(rest, LOOK_SECONDS)
             self._over.wait(pause)
             rest -= pause
@@ -165,11 +170,14 @@ class Builder:
             expected = self._process.returncode == BAD_INPUT
             if not expected:
                 print(said, file=sys.stderr, end="")
-            why = last if expected else f"The report failed: {last}"
-            self.shown = _notice(why) if before.folder is None else replace(before, trouble=why)
+            self._tell(last if expected else f"The report failed: {last}")
         for folder in self._folder.iterdir():
             if folder not in (self.shown.folder, before.folder):  # somebody may be reading the one before
                 shutil.rmtree(folder, ignore_errors=True)
+
+    def _tell(self, why: str) -> None:
+        """What keeps a newer page from being there."""
+        self.shown = _notice(why) if self.shown.folder is None else replace(self.shown, trouble=why)
 
 
 def fingerprint(places: Sequence[Path]) -> tuple[tuple[str, int, int], ...]:

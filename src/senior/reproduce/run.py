@@ -83,12 +83,13 @@ def _comparable(config: Config) -> Config:
     return replace(normal(config), device="auto", checkpoint_every=1, snapshot_every=1)
 
 
-def write(studies: dict[Table, Study], scale: Scale, out: Path) -> str:
+def write(studies: dict[Table, Study], scale: Scale, out: Path, seeds: int | None = None) -> str:
     """The page of what is finished below ``out``, in ``out/report``; returns its verdicts in lines for a terminal.
 
-    `BadInput` if no run of the studies is there.
+    seeds: only so many count, from 0 on; None: all that are there. `BadInput` if no run of the studies is there.
     """
     results = found([out])
+    results = results._replace(runs=tuple(run for run in results.runs if seeds is None or run.seed < seeds))
     runs, refused = runs_by_arm(studies.values(), scale, out, results.runs)
     if not runs and not refused:
         raise BadInput(f"{out} holds no finished run of the studies {', '.join(studies)} at the scale {scale}.")

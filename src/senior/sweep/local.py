@@ -11,6 +11,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from senior.processes import importing_alike
 from senior.rundir import threads, told
 from senior.sweep.cells import Done, Job, order, outcomes_of
 from senior.sweep.scheduler import LEAVE_SECONDS
@@ -81,11 +82,7 @@ class LocalCrew:
         """End all workers, everything saved."""
         self.stop()
         for worker in self._workers:
-            try:
-                worker.process.wait(LEAVE_SECONDS)
-            except subprocess.TimeoutExpired:
-                worker.process.kill()
-            self._bury(worker)
+            self._bury(worker, LEAVE_SECONDS)
         self._workers = []
 
     def _start(self) -> _Worker:
@@ -99,6 +96,7 @@ class LocalCrew:
         with open(log, "a") as file:
             process = subprocess.Popen(
                 command,
+                env=importing_alike(),
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=file,
@@ -124,19 +122,23 @@ class LocalCrew:
         worker.heard += told
         if worker.heard.endswith(b"\n"):
             outcomes, worker.heard, worker.job = outcomes_of(worker.heard.decode()), b"", None
+            if any(not (outcome.finished or outcome.failure) for outcome in outcomes):  # it was told to stop, and ends
+                self._workers.remove(worker)
+                self._bury(worker, LEAVE_SECONDS)
             return [Done(job, outcomes)]
         if told:
             return []
         self._workers.remove(worker)
-        if not dead:  # it dies, or has closed its pipe
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                worker.process.wait(1)
-            worker.process.kill()
-        self._bury(worker)
+        self._bury(worker, 1)  # it dies, or has closed its pipe
         return [Done(job, (), _why(worker.process.returncode, worker.log))]
 
-    def _bury(self, worker: _Worker) -> None:
-        worker.process.wait(LEAVE_SECONDS)
+    def _bury(self, worker: _Worker, patience: float = 0.0) -> None:
+        """Let go of one that ends; it is killed if it has not after so many seconds."""
+        try:
+            worker.process.wait(patience)
+        except subprocess.TimeoutExpired:
+            worker.process.kill()
+            worker.process.wait()
         os.close(worker.orders)
         os.close(worker.answers)
 

@@ -1,11 +1,15 @@
 // Keys: each counts once however long it is held, and none acts where it is needed by what has the focus.
 
+const IS_MAC = navigator.platform.startsWith("Mac"); // where Option makes a key's third characters
+
 /** The key by its character, not its place, so that it is the one the page shows on every keyboard layout. */
 function chord(event) {
   const key = event.key.toLowerCase();
-  if (event.altKey) return "";
-  const control = event.ctrlKey || event.metaKey ? "control+" : "";
-  return `${control}${event.shiftKey && key !== "?" ? "shift+" : ""}${key}`;
+  const character = key.length === 1 && !/\p{L}/u.test(key); // Shift or a third level may be what makes it
+  const third = event.getModifierState("AltGraph") || (event.altKey && (event.ctrlKey || IS_MAC));
+  if (event.altKey && !(character && third)) return "";
+  const control = (event.ctrlKey || event.metaKey) && !(character && third) ? "control+" : "";
+  return `${control}${event.shiftKey && !character ? "shift+" : ""}${key}`;
 }
 
 function ownKey(target, key) {

@@ -16,6 +16,7 @@ const TITLES = {
   finished: "Training has finished. Thank you.",
   stopped: "Training has stopped",
 };
+const RUN = document.body.dataset.run; // its identity
 const AWAY = 60_000; // ms out of sight after which the pair may have been leased to somebody else
 
 /** For measuring, in ms: from answer key to next clip, and to the acknowledgement; pairs loaded in time or not. */
@@ -84,11 +85,12 @@ function remember(store, name, value) {
 
 // Turns: what the server is asked, and what it says
 
-/** {status, data}, or null where the token is no longer good, which is shown. */
+/** {status, data}, or null where the token is no longer good, which is shown, or another run is served here. */
 async function send(path, body, wording) {
-  const reply = await post(path, body, wording, warn);
-  if (reply.status !== 401) return reply;
-  expire();
+  const reply = await post(path, { ...body, run: RUN }, wording, warn);
+  if (reply.status === 401) expire();
+  else if (reply.status === 410) location.reload();
+  else return reply;
   return null;
 }
 
@@ -301,7 +303,9 @@ function listen() {
   events = mine;
   mine.onopen = () => (el.connection.hidden = true);
   mine.addEventListener("state", (event) => {
-    showState(JSON.parse(event.data));
+    const news = JSON.parse(event.data);
+    if (news.identity !== RUN && !saving) return location.reload();
+    showState(news);
     if (state.trainer.phase !== "finished" || saving) return;
     show({ ...turn, pair: null, ahead: [], kind: "finished", why: state.trainer.text, state });
   });
@@ -371,7 +375,7 @@ async function saveGoal(event) {
 function askName(problem = "") {
   if (saving) return;
   el["name-problem"].textContent = problem;
-  el.name.value = annotator ?? remember("localStorage", "senior-annotator") ?? "person";
+  el.name.value = annotator ?? remember("localStorage", "senior-annotator") ?? "";
   el.start.showModal();
   el.name.select();
 }
@@ -435,7 +439,7 @@ function bindings() {
     arrowleft: left, a: left, arrowright: right, d: right,
     "shift+arrowleft": slightly.left, "shift+a": slightly.left,
     "shift+arrowright": slightly.right, "shift+d": slightly.right,
-    arrowdown: equal, e: equal, "=": equal, "shift+=": equal, s: skip,
+    arrowdown: equal, e: equal, "=": equal, s: skip,
     z: undo, backspace: undo, "control+z": undo, y: redo, "shift+z": redo, "control+y": redo, "control+shift+z": redo,
     " ": () => player.toggle(), ",": () => player.step(-1), ".": () => player.step(1),
     "[": () => shiftRate(-1), "]": () => shiftRate(1), x: cycle,
