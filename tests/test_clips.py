@@ -85,6 +85,13 @@ class Slow(Counting):
         return super().render()
 
 
+class Laborious(Counting):
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__(render_mode)
+        Path("at-work").touch()
+        time.sleep(60)
+
+
 class Blind(Counting):
     def render(self) -> Any:
         return None
@@ -510,6 +517,19 @@ def test_killed_at_any_moment(tmp_path: Path, process: Callable[[Path], subproce
         assert hashlib.sha256(file_of(tmp_path, row).read_bytes()).hexdigest() == row["sha256"]
         assert len(decoded(file_of(tmp_path, row))) == H
     assert drawer.stderr.read() == waiting.stderr.read() == b""  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def test_ended_while_an_environment_is_built(tmp_path: Path, process: Callable[[Path], subprocess.Popen[bytes]]):
+    """Which does not take the end of the process for a failure of its own."""
+    config = configuration(Laborious)
+    asked(tmp_path, config, lived(configuration(Counting), (0,), HORIZON), [((0, 0), (0, 5))])
+    (tmp_path / "config.json").write_text(json.dumps({"config": to_json(config)}))
+    Path("at-work").unlink(missing_ok=True)
+    drawer = process(tmp_path)
+    until(Path("at-work").exists)
+    drawer.send_signal(signal.SIGTERM)
+    assert drawer.wait(10) == 0
+    assert clips(tmp_path) == []
 
 
 def test_no_run(tmp_path: Path, process: Callable[[Path], subprocess.Popen[bytes]]):

@@ -256,6 +256,30 @@ class Exits(Lift):
         sys.exit("no licence")
 
 
+class Closed(Lift):
+    """Ends the program once it was told that its window is closed."""
+
+    closed = False
+
+    def step(self, action: np.ndarray):
+        self.leave()
+        return super().step(action)
+
+    def reset(self, **options: Any):
+        self.leave()
+        return super().reset(**options)
+
+    def render(self):
+        self.leave()
+
+    def close(self):
+        self.leave()
+
+    def leave(self) -> None:
+        if self.closed:
+            sys.exit("window closed")
+
+
 class FailsAtOnce(Lift):
     def step(self, action: np.ndarray):
         raise OSError("cable")
@@ -282,6 +306,18 @@ def test_a_custom_environment():
         assert info["success"] is True
         low, high = Lift.action_space.low, Lift.action_space.high
         np.testing.assert_allclose(observation[:3], low + share * (high - low), rtol=1e-6)
+
+
+def test_no_environment_ends_the_program(monkeypatch: pytest.MonkeyPatch):
+    place = Local(lambda: envs.make(None, f"{HERE}:Closed", "0:3", horizon=20), 0, TRAINING)
+    assert place.begin(0) is None
+    monkeypatch.setattr(Closed, "closed", True)
+    failure = go(place, np.zeros(3, np.float32))
+    assert isinstance(failure, Failure) and failure.message.endswith("after step 0: ProgramEnded: window closed")
+    assert isinstance(place.begin(1), Failure)
+    with pytest.raises(custom.ProgramEnded):
+        place.env.render()
+    place.env.close()
 
 
 def test_horizon_of_a_custom_environment():
@@ -314,7 +350,7 @@ def test_a_users_file_in_the_current_directory(tmp_path, monkeypatch):
         (f"{HERE}:DiscreteActions", "acts in Discrete.*bounded Box"),
         (f"{HERE}:Unbounded", "acts in Box.*bounded Box"),
         (f"{HERE}:Broken", "cannot be built: OSError: no robot attached"),
-        (f"{HERE}:Exits", "cannot be built: SystemExit: no licence"),
+        (f"{HERE}:Exits", "cannot be built: ProgramEnded: no licence"),
         (f"{HERE}:FailsAtOnce", "fails at its first step: OSError: cable"),
         ("Pendulum-v11", "did you mean Pendulum-v1"),
     ],
@@ -504,8 +540,6 @@ class Faulty(point.Point):
                     observation = observation[:3]
                 case "raise":
                     raise RuntimeError("motor\nburnt")
-                case "exit":
-                    sys.exit("window closed")
         return observation, reward, terminated, truncated, info
 
 
@@ -517,7 +551,6 @@ class Faulty(point.Point):
         ("reward", "the reward is inf"),
         ("shape", r"shape \(3,\) instead of \(4,\)"),
         ("raise", "RuntimeError: motor burnt"),
-        ("exit", "SystemExit: window closed"),
         ("reset", "ValueError: stuck"),
     ],
 )

@@ -264,7 +264,10 @@ def test_runs_that_were_not_evaluated_until_half_cost_the_page_of_no_others(tmp_
 def test_a_name_that_is_no_text_costs_no_page(tmp_path: Path):
     evaluated(tmp_path / "run", config(), [0, 0, 0, 1])
     broken = Path(os.fsdecode(bytes(tmp_path) + b"/caf\xe9"))
-    broken.mkdir()
+    try:
+        broken.mkdir()
+    except OSError:
+        pytest.skip("this file system has no such names")
     (broken / "config.json").write_text("{")
     assert r"caf\udce9" in report([tmp_path], tmp_path / "out").page.read_text()
 

@@ -323,13 +323,25 @@ def test_a_run_of_another_machine_goes_on_but_says_so(reference: Path, tmp_path:
     assert sentence.startswith("seed 0: threads and packages differ from when the run began, so it goes on but")
 
 
+def test_what_could_not_be_read_again_is_not_begun(tmp_path: Path):
+    with pytest.raises(BadInput, match=r"expected int @ \$\.checkpoint_every"):
+        train(replace(short(), checkpoint_every=20.0), tmp_path, watcher=Stop())  # pyright: ignore[reportArgumentType]
+    assert not list(tmp_path.iterdir())
+
+
 def test_runs_of_another_device_than_the_first_are_left_to_be_resumed_by_themselves(reference: Path, tmp_path: Path):
+    """One that has no steps to take does not matter."""
     shutil.copytree(reference, tmp_path, dirs_exist_ok=True)
-    other = tmp_path / "seed-1" / "config.json"
-    other.write_text(other.read_text().replace('"device": "cpu"', '"device": "gpu"', 1))
+    shutil.copytree(reference / "seed-0", tmp_path / "over")
+    for name in ("seed-0", "seed-1"):
+        (tmp_path / name / "checkpoints" / "step-0000001000.npz").unlink()
+    for name in ("seed-1", "over"):
+        about = tmp_path / name / "config.json"
+        about.write_text(about.read_text().replace('"device": "cpu"', '"device": "gpu"', 1))
     watcher = Stop()
-    left, first = resume(tmp_path, watcher)
-    assert first.finished and first.path == tmp_path / "seed-0"
+    over, first, left = resume(tmp_path, watcher)
+    assert [result.path.name for result in (over, first, left)] == ["over", "seed-0", "seed-1"]
+    assert over.finished and first.finished
     assert left.failure == "It is computed on the GPU, and others here on the CPU; resume it by itself."
     assert f"{tmp_path / 'seed-1'}: {left.failure}" in watcher.said
 

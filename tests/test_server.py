@@ -699,6 +699,7 @@ def test_a_run_has_one_server_and_only_its_owner_can_read_the_token(fresh: Stand
     [
         ("user", Address(token="wanted"), True),
         ("trainer", Address(), True),
+        ("trainer", Address(host="localhost"), False),
         ("trainer", Address(token="wanted"), False),
         ("trainer", Address(allowed_hosts=("robot",)), False),
     ],

@@ -6,13 +6,14 @@ from pathlib import Path
 
 from senior import envs, labels, parts
 from senior.checks import check
-from senior.config import Config, made_by
+from senior.config import Config, from_json, made_by, to_json
 from senior.types import BadInput, EnvSpec
 
 
 def check_offered(config: Config) -> None:
     """`BadInput` for what makes no sense, or is not offered for training."""
     check(config)
+    from_json(to_json(config))  # numbers of another type could not be read again
     if config.precision != "float32":  # `senior bench` may measure it
         raise BadInput(
             f"--precision {config.precision} is not offered: its learning curves do not agree well enough with "

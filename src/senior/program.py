@@ -205,8 +205,9 @@ def resume(
     """Continue an interrupted run, or every run under a directory; those that are finished stay as they are.
 
     Runs of one shape that stand at the same step go on in one program. One that cannot go on is told, and the others
-    do; so is one that is computed on another device than the first. ``workers``, ``runs_per_device``, ``page``: see
-    `train_all`. Raises `BadInput` if there is no run, or the only one cannot go on.
+    do; so is one that is computed on another device than the first that has steps to take. ``workers``,
+    ``runs_per_device``, ``page``: see `train_all`. Returns one `Result` per run, by path. Raises `BadInput` if there is
+    no run, or the only one cannot go on.
     """
     _check_machine(workers, runs_per_device)
     watcher = watcher or Quiet()
@@ -216,7 +217,7 @@ def resume(
         device = wanted = ""
         waiting: list[Waiting] = []
         results: list[Result] = []
-        for directory in found:
+        for directory in sorted(found, key=_is_over):
             trainee = None
             try:
                 config = load(directory / "config.json")
@@ -224,7 +225,7 @@ def resume(
                 if pools is None:
                     device, wanted = prepare_device(config.device), config.device
                     pools = stack.enter_context(Pools(workers, device))
-                if config.device != wanted:
+                if config.device != wanted and not _is_over(directory):
                     raise BadInput(
                         f"It is computed on the {config.device.upper()}, and others here on the {wanted.upper()}; "
                         "resume it by itself."
@@ -238,7 +239,16 @@ def resume(
                 if len(found) == 1:
                     raise
                 results.append(unopened(directory, error, watcher))
-        return results + train_waiting(waiting, watcher, None, runs_per_device, len(found) == 1, page)
+        results += train_waiting(waiting, watcher, None, runs_per_device, len(found) == 1, page)
+    return sorted(results, key=lambda result: found.index(result.path))
+
+
+def _is_over(run: Path) -> bool:
+    """Whether a run has no steps to take."""
+    try:
+        return next(iter(rundir.saved_steps(run / "checkpoints")), -1) >= load(run / "config.json").steps
+    except BadInput:
+        return False
 
 
 def find_runs(path: Path | str) -> list[Path]:

@@ -306,12 +306,13 @@ def _version(name: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The commit of the source tree this package runs from, if it is one; "-changed" where its files differ from it."""
+    """The commit of the source tree this package runs from, if it is one; "-changed" where its files differ from it
+    or one is not in it."""
     source = Path(__file__).resolve().parent
     if source.parent.name != "src":
         return None
     try:
-        changed = _git(source, "status", "--porcelain", "--", ".")
+        changed = _git(source, "--no-optional-locks", "status", "--porcelain", "--", ".")
         return _git(source, "rev-parse", "HEAD") + ("-changed" if changed else "")
     except (OSError, subprocess.SubprocessError):
         return None

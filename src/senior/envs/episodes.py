@@ -149,7 +149,7 @@ class Local:
             observation = _checked(raw, spec)
             reward = _finite("reward", reward)
             success = _finite("success", info.get("success", 0.0)) if spec.tells_success else None
-        except (Exception, SystemExit) as error:  # some say that their window was closed by ending the program
+        except Exception as error:
             return self._fail(error)
         self.elapsed += 1
         terminated = bool(terminated)
@@ -171,11 +171,11 @@ class Local:
         try:
             raw, _ = self.env.reset(seed=episode_seed(self.seed, self.purpose, self.episode))
             self.observation = _checked(raw, self.spec)
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             return self._fail(error)
         return None
 
-    def _fail(self, error: BaseException) -> Failure:
+    def _fail(self, error: Exception) -> Failure:
         cause = str(error) if isinstance(error, _BadNumber) else f"{type(error).__name__}: {error}"
         self.failure = Failure(
             f"The environment {self.spec.name} of seed {self.seed} failed in episode "

@@ -10,7 +10,8 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -19,6 +20,38 @@ from gymnasium import spaces
 from gymnasium.wrappers import RescaleAction, TimeLimit, TransformAction
 
 from senior.types import BadInput, EnvSpec
+
+
+class ProgramEnded(Exception):
+    """An environment wanted to end the program, as some do when their window is closed."""
+
+
+@contextmanager
+def _staying() -> Iterator[None]:
+    try:
+        yield
+    except SystemExit as end:
+        raise ProgramEnded(str(end)) from end
+
+
+class Staying(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Raises `ProgramEnded` where the environment would end the program."""
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        with _staying():
+            return self.env.step(action)
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        with _staying():
+            return self.env.reset(**options)
+
+    def render(self) -> Any:
+        with _staying():
+            return self.env.render()
+
+    def close(self) -> None:
+        with suppress(SystemExit):
+            self.env.close()
 
 
 class IsSuccess(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -101,8 +134,9 @@ def _constructor(name: str) -> Callable[..., Any]:
     if os.getcwd() not in sys.path and "" not in sys.path:
         sys.path.append(os.getcwd())
     try:
-        module = importlib.import_module(module_name)
-    except (Exception, SystemExit) as error:
+        with _staying():
+            module = importlib.import_module(module_name)
+    except Exception as error:
         raise BadInput(f"The module of --env {name} cannot be imported: {_told(error)}") from error
     if attribute in gymnasium.registry:
         return _registered(attribute)
@@ -126,18 +160,19 @@ def _registered(name: str) -> Callable[..., Any]:
 
 def _started(name: str, construct: Callable[..., Any], render: bool) -> gymnasium.Env[Any, Any]:
     try:
-        if render:
-            try:
-                env = construct(render_mode="rgb_array")
-            except TypeError:  # it takes no such argument; it may draw all the same
+        with _staying():
+            if render:
+                try:
+                    env = construct(render_mode="rgb_array")
+                except TypeError:  # it takes no such argument; it may draw all the same
+                    env = construct()
+            else:
                 env = construct()
-        else:
-            env = construct()
-    except (Exception, SystemExit) as error:
+    except Exception as error:
         raise BadInput(f"The environment {name} cannot be built: {_told(error)}") from error
     if not isinstance(env, gymnasium.Env):
         raise BadInput(f"--env {name} gives a {type(env).__name__}, not a Gymnasium environment.")
-    return env
+    return Staying(env)
 
 
 def _observation_size(name: str, space: spaces.Space[Any]) -> int:
@@ -190,11 +225,11 @@ def _probe(name: str, construct: Callable[..., Any]) -> dict[str, Any]:
         env.reset(seed=0)
         middle = (env.action_space.low + env.action_space.high) / 2  # pyright: ignore[reportAttributeAccessIssue]
         return env.step(middle.astype(env.action_space.dtype))[4]
-    except (Exception, SystemExit) as error:
+    except Exception as error:
         raise BadInput(f"The environment {name} fails at its first step: {_told(error)}") from error
     finally:
         env.close()
 
 
-def _told(error: BaseException) -> str:
+def _told(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")

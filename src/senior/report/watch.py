@@ -37,6 +37,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from senior.label.address import is_loopback
 from senior.label.guard import SEALED
+from senior.processes import importing_alike
 from senior.rundir import is_run
 from senior.types import BAD_INPUT, BadInput
 
@@ -143,7 +144,7 @@ class Builder:
                     known, rest = now, max(self._least, REST * (time.monotonic() - began))
             except Exception as error:  # no memory for a process, and whatever else may pass
                 self._tell(f"The report failed: {type(error).__name__}: {error}")
-                rest = self._least
+                known, rest = None, self._least
             pause = LOOK_SECONDS if rest <= 0 else min(rest, LOOK_SECONDS)
             self._over.wait(pause)
             rest -= pause
@@ -155,7 +156,12 @@ class Builder:
         command = [sys.executable, "-m", "senior.report.watch", str(out), *map(str, self.places)]
         # a session of its own: it is ended by us, not by the keyboard's interrupt
         self._process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+            command,
+            env=importing_alike(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
         )
         if self._over.is_set():
             self._process.terminate()

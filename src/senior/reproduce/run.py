@@ -89,12 +89,16 @@ def write(studies: dict[Table, Study], scale: Scale, out: Path, seeds: int | Non
     seeds: only so many count, from 0 on; None: all that are there. `BadInput` if no run of the studies is there.
     """
     results = found([out])
-    results = results._replace(runs=tuple(run for run in results.runs if seeds is None or run.seed < seeds))
+    wanted = tuple(run for run in results.runs if seeds is None or run.seed < seeds)
+    beyond = len(results.runs) - len(wanted)
+    results = results._replace(runs=wanted)
     runs, refused = runs_by_arm(studies.values(), scale, out, results.runs)
     if not runs and not refused:
         raise BadInput(f"{out} holds no finished run of the studies {', '.join(studies)} at the scale {scale}.")
     judged = page.judge(list(studies), studies, runs)
     notes = [*_restriction(studies), *refused]
+    if beyond:
+        notes.append(f"Left out on demand: {beyond} finished runs of seeds from {seeds} on.")
     built = page_of(results, out / "report", page.sections(judged, scale, notes))
     return "\n".join([page.summary(judged, scale), *notes, str(built.page)])
 

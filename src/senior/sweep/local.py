@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from senior.processes import importing_alike
@@ -26,6 +27,8 @@ class _Worker:
     log: Path
     job: Job | None = None
     heard: bytes = b""
+    leaving: bool = False
+    """It was told to stop, and ends."""
 
 
 class LocalCrew:
@@ -58,7 +61,7 @@ class LocalCrew:
             idle.remove(worker)
             self._workers.remove(worker)
             self._bury(worker)
-        worker = idle[0] if idle else self._start()
+        worker = next((worker for worker in idle if not worker.leaving), None) or self._start()
         worker.job = job
         with contextlib.suppress(BrokenPipeError):  # it died idle; `wait` finds out
             os.write(worker.orders, f"{order(job)}\n".encode())
@@ -87,7 +90,7 @@ class LocalCrew:
 
     def _start(self) -> _Worker:
         taken = {worker.log for worker in self._workers}
-        names = (self._logs / f"worker-{i}.log" for i in range(self.size + 1))
+        names = (self._logs / f"worker-{i}.log" for i in count())
         log = next(name for name in names if name not in taken)
         orders, give = os.pipe()
         hear, answers = os.pipe()
@@ -122,9 +125,7 @@ class LocalCrew:
         worker.heard += told
         if worker.heard.endswith(b"\n"):
             outcomes, worker.heard, worker.job = outcomes_of(worker.heard.decode()), b"", None
-            if any(not (outcome.finished or outcome.failure) for outcome in outcomes):  # it was told to stop, and ends
-                self._workers.remove(worker)
-                self._bury(worker, LEAVE_SECONDS)
+            worker.leaving = any(not (outcome.finished or outcome.failure) for outcome in outcomes)
             return [Done(job, outcomes)]
         if told:
             return []
@@ -156,7 +157,13 @@ def find_device(device: str) -> str:
         return device
     program = "import sys\nfrom senior.runs import prepare_device\nfrom senior.types import BadInput\n"
     program += f"try:\n    print(prepare_device({device!r}))\nexcept BadInput as error:\n    sys.exit(str(error))\n"
-    asked = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, start_new_session=True)
+    asked = subprocess.run(
+        [sys.executable, "-c", program],
+        env=importing_alike(),
+        capture_output=True,
+        text=True,
+        start_new_session=True,
+    )
     if asked.returncode:
         raise BadInput((asked.stderr.strip().splitlines() or ["The device cannot be found out."])[-1])
     return asked.stdout.strip()
