@@ -88,7 +88,7 @@ class Slow(Counting):
 class Laborious(Counting):
     def __init__(self, render_mode: str | None = None) -> None:
         super().__init__(render_mode)
-        Path("at-work").touch()
+        Path(os.environ["AT_WORK"]).touch()
         time.sleep(60)
 
 
@@ -519,14 +519,17 @@ def test_killed_at_any_moment(tmp_path: Path, process: Callable[[Path], subproce
     assert drawer.stderr.read() == waiting.stderr.read() == b""  # pyright: ignore[reportOptionalMemberAccess]
 
 
-def test_ended_while_an_environment_is_built(tmp_path: Path, process: Callable[[Path], subprocess.Popen[bytes]]):
+def test_ended_while_an_environment_is_built(
+    tmp_path: Path, process: Callable[[Path], subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
+):
     """Which does not take the end of the process for a failure of its own."""
+    at_work = tmp_path / "at-work"
+    monkeypatch.setenv("AT_WORK", str(at_work))
     config = configuration(Laborious)
     asked(tmp_path, config, lived(configuration(Counting), (0,), HORIZON), [((0, 0), (0, 5))])
     (tmp_path / "config.json").write_text(json.dumps({"config": to_json(config)}))
-    Path("at-work").unlink(missing_ok=True)
     drawer = process(tmp_path)
-    until(Path("at-work").exists)
+    until(at_work.exists)
     drawer.send_signal(signal.SIGTERM)
     assert drawer.wait(10) == 0
     assert clips(tmp_path) == []
