@@ -259,6 +259,12 @@ def test_a_video_or_figures_in_a_place_that_cannot_be(capsys: pytest.CaptureFixt
     Path("run/config.json").write_text(json.dumps(about))
     assert "file is, or lies in, a file where a directory should be." in refused("eval run --video file/a.mp4", capsys)
     assert "file is, or lies in, a file where a directory should be." in refused("bench --json file/a.json", capsys)
+    assert "--video film.avi must be named NAME.mp4" in refused("eval run --video film.avi", capsys)
+    Path("notes.mp4").write_text("precious")
+    assert "notes.mp4 is no video, and would be overwritten" in refused("eval run --video notes.mp4", capsys)
+    assert Path("notes.mp4").read_text() == "precious"
+    if Path("/proc").is_dir():
+        assert "/proc/film.mp4 cannot be opened: " in refused("eval run --video /proc/film.mp4", capsys)
 
 
 DAMAGED = {
@@ -294,6 +300,9 @@ def test_what_is_no_run(capsys: pytest.CaptureFixture[str]):
     assert "--episodes must be at least 1, not 0" in refused("eval early/seed-0 --episodes 0", capsys)
     assert "--episodes needs a whole number, not 'x'" in refused("eval early/seed-0 --episodes x", capsys)
     assert "--video films one run" in refused("eval early --video film.mp4", capsys)
+    assert main(["eval", "early"]) == FAILED  # each is told, and the others are judged
+    told = capsys.readouterr().err.splitlines()
+    assert [line.partition(":")[0] for line in told] == ["early/seed-0", "early/seed-1"]
     Path("early/seed-0/policy").mkdir()
     Path("early/seed-0/policy/actor.npz").write_bytes(b"PK no archive")
     assert "early/seed-0 cannot be read" in refused("eval early/seed-0", capsys)

@@ -138,7 +138,10 @@ def test_a_file_that_is_no_grid_is_refused(content: str, said: str, tmp_path: Pa
         ("--segment 600", "does not fit into an episode"),
         ("--env nosuch:Thing", "nosuch"),
         ("--env tests.test_sweep:Fragile", "--position"),
-        (r"--arm=mrn --budget=50 --arm=pebble\ --budget\ 100", "a --budget of its own"),
+        (
+            r"--arm=mrn --budget=50 --arm=pebble\ --budget\ 100",
+            "and the sweep both have --budget; give it to the arms that need it",
+        ),
         ("--file nowhere.toml", "nowhere.toml cannot be read"),
     ],
 )

@@ -44,12 +44,9 @@ def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None 
 
     Raises `BadInput` if there is no such run or no policy yet, ``video`` cannot be written, or the environment fails.
     """
-    if episodes < 1:
-        raise BadInput(f"--episodes must be at least 1, not {episodes}.")
+    check_asked(episodes, video)
     path = Path(path)
     config = load(path / "config.json")
-    if video is not None:
-        rundir.make_room(Path(video))
     prepare_device("auto")
     step, actor = load_policy(path)
     policy = jax.jit(mean_action)
@@ -76,6 +73,24 @@ def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None 
         None if video is None or reason else Path(video),
         reason,
     )
+
+
+def check_asked(episodes: int, video: Path | str | None) -> None:
+    """`BadInput` for no episodes, or for a video that cannot be written or would take the place of something else."""
+    if episodes < 1:
+        raise BadInput(f"--episodes must be at least 1, not {episodes}.")
+    if video is None:
+        return
+    file = Path(video)
+    if file.suffix != ".mp4":
+        raise BadInput(f"--video {file} must be named NAME.mp4.")
+    rundir.make_room(file)
+    with rundir.told(file):
+        if file.exists() and file.read_bytes()[4:8] != b"ftyp":
+            raise BadInput(f"{file} is no video, and would be overwritten; name another file.")
+        unfinished = file.with_name(f"{file.name}.part")  # as it is named until it is whole
+        unfinished.touch()
+        unfinished.unlink()
 
 
 def film_policy(path: Path, out: Path) -> str | None:

@@ -195,7 +195,7 @@ class WatchOptions:
     """Serve the page of senior report, live, while runs are trained."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Run directories, or directories that hold some, or are there already and will."""
+    """Run directories, or directories that hold some or will."""
     host: str = "127.0.0.1"
     """Address to listen on. 0.0.0.0 lets other machines in, all of them: there is no token."""
     port: int = 0

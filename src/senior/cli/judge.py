@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from senior.cli.shared import DONE
+from senior.cli.shared import DONE, FAILED
 from senior.options import parse
 from senior.types import BadInput
 
@@ -57,8 +58,17 @@ def evaluate(arguments: list[str]) -> int:
     found = program.find_runs(options.run)
     if options.video and len(found) > 1:
         raise BadInput(f"--video films one run, and there are {len(found)} under {options.run}; name one of them.")
+    judgement.check_asked(options.episodes, options.video)
+    code = DONE
     for path in found:
-        judged = judgement.evaluate_run(path, options.episodes, options.video)
+        try:
+            judged = judgement.evaluate_run(path, options.episodes, options.video)
+        except BadInput as error:
+            if len(found) == 1:
+                raise
+            print(f"{path}: {error}", file=sys.stderr)
+            code = FAILED
+            continue
         success = "not told" if judged.success_rate is None else f"{judged.success_rate:.3f}"
         print(
             f"{path}: policy of step {judged.step}, {judged.episodes} fresh episodes: success rate {success}, "
@@ -66,7 +76,7 @@ def evaluate(arguments: list[str]) -> int:
         )
         if options.video:
             print(judged.no_video or f"video: {judged.video}")
-    return DONE
+    return code
 
 
 def bench(arguments: list[str]) -> int:

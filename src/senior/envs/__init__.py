@@ -22,7 +22,7 @@ def tasks_table() -> list[tuple[str, str, str]]:
     rows = [
         (name, task.sentence, "visible" if task.goal_observable else "hidden") for name, task in metaworld.TASKS.items()
     ]
-    return [*rows, ("point", "Move a point to the goal (a toy, solved in seconds)", "visible")]
+    return [*rows, ("point", "Move a point to the goal (a toy)", "visible")]
 
 
 def make(

@@ -1,4 +1,4 @@
-"""A point that is to be moved to a goal: a toy that is solved in seconds, for tests and first steps.
+"""A point that is to be moved to a goal: a toy, for tests and first steps.
 
 The observation holds the way to the goal, so a linear policy solves it.
 """

@@ -294,6 +294,8 @@ def serve(places: Sequence[Path], host: str = "127.0.0.1", port: int = 0, least:
     port: 0: any that is free. least: seconds between two buildings of the page. Prints the address. Raises `BadInput`
     if a place is not there or the address cannot be listened on.
     """
+    if not 0 <= port < 2**16:
+        raise BadInput(f"--port {port} must be between 0 and 65535.")
     for place in places:
         if not place.is_dir():
             raise BadInput(f"{place} is no directory." if place.exists() else f"There is no directory {place}.")

@@ -55,7 +55,8 @@ def read(file: Path) -> Grid:
     try:
         content = tomllib.loads(file.read_text())
     except (OSError, ValueError) as error:
-        raise BadInput(f"{file} cannot be read: {error}.") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise BadInput(f"{file} cannot be read: {reason}.") from error
     grid: Grid = {}
     for key, value in _flat(content, ""):
         name = key.replace("_", "-")
@@ -102,7 +103,12 @@ def cells_of(grid: Grid, out: Path) -> list[Cell]:
     axes.setdefault("task", ["door-lock"])
     for arm in axes["arm"]:
         own = {word[2:].partition("=")[0].replace("_", "-") for word in arm.split() if word.startswith("--")}
-        for name in sorted(own & {*axes, "task", "seed"}):
+        for name in sorted(own & {*axes} - {"task", "seed"}):
+            raise BadInput(
+                f"The arm {arm!r} and the sweep both have --{name}; give it to the arms that need it, or to the sweep "
+                "for all of them."
+            )
+        for name in sorted(own & {"task", "seed"}):
             raise BadInput(f"The arm {arm!r} has a --{name} of its own; give it to the sweep, for all arms.")
     axes = {"seed": axes.pop("seed", ["0"]), **axes}  # the first seed of every arm comes before the second of any
     varied = [name for name, values in axes.items() if len(values) > 1 and name not in ("arm", "task", "seed", "env")]
