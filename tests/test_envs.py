@@ -130,7 +130,8 @@ def test_meta_world_bad_input():
         metaworld.MetaWorld("door-lock", reward_function_version="v1")
 
 
-def test_training_draws_nothing_and_needs_no_jax():
+def test_training_draws_nothing_and_needs_no_jax(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)  # a test before this one may have drawn
     program = (
         "import sys; sys.modules['jax'] = None\n"
         "import senior.envs.worker, senior.envs.render, senior.envs as envs\n"
