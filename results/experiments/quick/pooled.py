@@ -1,4 +1,4 @@
-"""Success at step 45,000 of every door-close run, those of the CPU and those of the GPU: python pooled.py, in this folder.
+"""Success at step 45,000 of every door-close run, of the CPU and of the GPU: python pooled.py, in this folder.
 
 A seed that was trained on both counts twice: its runs share no more than their number.
 """

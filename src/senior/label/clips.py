@@ -44,6 +44,7 @@ SLOWEST_FPS = 8
 """...and it need not be slower than this."""
 PAUSE = 0.2
 """Seconds between looks for something to do."""
+ENDING = signal.SIGTERM, signal.SIGINT
 GRACE = 10.0
 """Seconds in which a process that is to end must have ended by itself."""
 
@@ -229,6 +230,8 @@ class _Over(BaseException):
 
 
 def _end(*_: object) -> None:
+    for number in ENDING:  # once is enough
+        signal.signal(number, signal.SIG_IGN)
     raise _Over
 
 
@@ -247,10 +250,10 @@ def main(arguments: list[str]) -> int:
     if len(arguments) != 1:
         print("Usage: python -m senior.label.clips RUN", file=sys.stderr)
         return 2
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, _end)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
+        for number in ENDING:
+            signal.signal(number, _end)
+        threading.Thread(target=_end_with_parent, daemon=True).start()
         serve(Path(arguments[0]))
     except BadInput as error:
         print(error, file=sys.stderr)
