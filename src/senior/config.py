@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -356,14 +357,19 @@ def to_json(config: Config) -> dict[str, Any]:
 
 def from_json(data: dict[str, Any]) -> Config:
     """Read a configuration. `BadInput` for an unknown key or a value of the wrong type."""
-    converter = cattrs.Converter(forbid_extra_keys=True)
-    for kind in (bool, int, float, str):
-        converter.register_structure_hook(kind, _exactly)
     try:
-        return converter.structure(data, Config)
+        return _converter().structure(data, Config)
     except (cattrs.BaseValidationError, TypeError, ValueError) as error:
         reasons = "; ".join(cattrs.transform_error(error))
         raise BadInput(f"The configuration cannot be read: {reasons}.") from error
+
+
+@cache
+def _converter() -> cattrs.Converter:
+    converter = cattrs.Converter(forbid_extra_keys=True)
+    for kind in (bool, int, float, str):
+        converter.register_structure_hook(kind, _exactly)
+    return converter
 
 
 def _exactly(value: Any, kind: type[Any]) -> Any:

@@ -86,8 +86,10 @@ def check_asked(episodes: int, video: Path | str | None) -> None:
         raise BadInput(f"--video {file} must be named NAME.mp4.")
     rundir.make_room(file)
     with rundir.told(file):
-        if file.exists() and file.read_bytes()[4:8] != b"ftyp":
-            raise BadInput(f"{file} is no video, and would be overwritten; name another file.")
+        if file.exists():
+            with file.open("rb") as there:
+                if there.read(8)[4:] != b"ftyp":
+                    raise BadInput(f"{file} is no video, and would be overwritten; name another file.")
         unfinished = file.with_name(f"{file.name}.part")  # as it is named until it is whole
         unfinished.touch()
         unfinished.unlink()

@@ -217,7 +217,8 @@ def resume(
         device = wanted = ""
         waiting: list[Waiting] = []
         results: list[Result] = []
-        for directory in sorted(found, key=_is_over):
+        over = {directory: _is_over(directory) for directory in found}
+        for directory in sorted(found, key=over.__getitem__):
             trainee = None
             try:
                 config = load(directory / "config.json")
@@ -225,7 +226,7 @@ def resume(
                 if pools is None:
                     device, wanted = prepare_device(config.device), config.device
                     pools = stack.enter_context(Pools(workers, device))
-                if config.device != wanted and not _is_over(directory):
+                if config.device != wanted and not over[directory]:
                     raise BadInput(
                         f"It is computed on the {config.device.upper()}, and others here on the {wanted.upper()}; "
                         "resume it by itself."

@@ -22,11 +22,12 @@ class BadInput(Exception):
     """Something the user gave cannot work. Its text is one clear sentence; the program ends with `BAD_INPUT`."""
 
     @classmethod
-    def unknown(cls, kind: str, name: str, known: Iterable[str]) -> BadInput:
-        """That ``name`` is no ``kind`` we know, with the nearest name that is."""
+    def unknown(cls, kind: str, name: str, known: Iterable[str], otherwise: str | None = None) -> BadInput:
+        """That ``name`` is no ``kind`` we know, with the nearest name that is; where none is near, what to do
+        ``otherwise``, or all that are known."""
         names = list(known)
         near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
-        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(names)}."
+        hint = f"did you mean {near[0]}?" if near else otherwise or f"known are {', '.join(names)}."
         return cls(f"Unknown {kind} {name!r}; {hint}")
 
 

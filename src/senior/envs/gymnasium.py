@@ -6,7 +6,6 @@ by replaying them), and ``info["success"]`` or ``info["is_success"]``, if told a
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import os
 import re
@@ -155,12 +154,11 @@ def _public(module: Any) -> list[str]:
 
 def _registered(name: str) -> Callable[..., Any]:
     if name not in gymnasium.registry:
-        if difflib.get_close_matches(name, gymnasium.registry, 1):
-            raise BadInput.unknown("environment", name, gymnasium.registry)
-        raise BadInput(
-            f"Unknown environment {name!r}; give an id that is registered with Gymnasium, or a class or function of a "
-            f"module of yours: {name.removesuffix('.py')}:Name."
+        otherwise = (
+            "give an id that is registered with Gymnasium, or a class or function of a module of yours: "
+            f"{name.removesuffix('.py')}:Name."
         )
+        raise BadInput.unknown("environment", name, gymnasium.registry, otherwise)
     return lambda **options: gymnasium.make(name, disable_env_checker=True, **options)
 
 

@@ -45,6 +45,7 @@ SLOWEST_FPS = 8
 PAUSE = 0.2
 """Seconds between looks for something to do."""
 ENDING = signal.SIGTERM, signal.SIGINT
+"""What ends this process."""
 GRACE = 10.0
 """Seconds in which a process that is to end must have ended by itself."""
 

@@ -35,7 +35,7 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainT
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from senior.label.address import is_loopback
+from senior.label.address import is_loopback, listening_at
 from senior.label.guard import SEALED
 from senior.processes import importing_alike
 from senior.rundir import is_run
@@ -299,7 +299,10 @@ def serve(places: Sequence[Path], host: str = "127.0.0.1", port: int = 0, least:
     for place in places:
         if not place.is_dir():
             raise BadInput(f"{place} is no directory." if place.exists() else f"There is no directory {place}.")
-    listening = _bind(host, port)
+    try:
+        listening = listening_at(host, port)
+    except OSError as error:
+        raise BadInput(f"Cannot listen on {host}, port {port}: {error.strerror or error}.") from error
     shown = f"[{host}]" if ":" in host else host
     builder = Builder(places, least)
     config = uvicorn.Config(
@@ -325,20 +328,6 @@ def serve(places: Sequence[Path], host: str = "127.0.0.1", port: int = 0, least:
         builder.close()
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _bind(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # the protocol is told: else asyncio leaves Nagle's algorithm on, which costs 40 ms for every answer
-    listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listening.bind((host, port))
-        listening.listen(128)
-    except (OSError, OverflowError) as error:
-        listening.close()
-        raise BadInput(f"Cannot listen on {host}, port {port}: {getattr(error, 'strerror', None) or error}.") from error
-    return listening
 
 
 def main(arguments: Sequence[str]) -> int:
