@@ -105,8 +105,9 @@ def test_vmap_and_the_loop_compute_the_same(tmp_path: Path):
     results: dict[str, list[Any]] = {lift: [] for lift in both}
     for lift, lifted in both.items():
         before = jax.tree.map(np.asarray, [lifted[i].agent.actor for i in range(2)])
-        results[lift].append(lifted.every(learner.learn, ("agent",), [True, True], [at, at], [np.int32(0)] * 2))
-        results[lift].append(lifted.every(learner.store, ("replay", "learned_return"), [True, True], facts))
+        given = lifted.give(fact=facts, step=[at, at], recent=[np.int32(0)] * 2)
+        results[lift].append(lifted.every(learner.learn, ("agent",), [True, True], given, "step", "recent"))
+        results[lift].append(lifted.every(learner.store, ("replay", "learned_return"), [True, True], given, "fact"))
         results[lift].append(lifted.one(1, learner.fit, labelled, at))
         results[lift].append(lifted.one(0, learner.refresh, at))
         after = [lifted[i].agent.actor for i in range(2)]

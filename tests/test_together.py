@@ -12,13 +12,13 @@ import jax
 import numpy as np
 import pytest
 
-from senior import fit, learner, parts, together
+from senior import fit, learner, parts, together, trainee
 from senior.config import Config
 from senior.learner import Learner
 from senior.loop import Training
 from senior.methods import METHODS
 from senior.presets import preset, release
-from senior.program import Quiet, make_learner, resume, train_all
+from senior.program import Quiet, make_learner, resume, train, train_all
 from senior.replay import Fact
 from senior.reward.bilevel import FirstSteps
 from senior.reward.model import Labelled
@@ -190,6 +190,20 @@ def test_under_vmap_a_run_depends_neither_on_its_neighbour_nor_on_the_program_be
     assert all(result.finished for result in train_all(first, Said(), lift="vmap"))
     train_all([(short(), tmp_path / "two" / "a"), (short(seed=3), tmp_path / "two" / "b")], Said(), lift="vmap")
     assert_same_run(tmp_path / "one" / "a", tmp_path / "two" / "a", interrupted=False)
+
+
+def test_episodes_judged_side_by_side_are_those_judged_one_after_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """As on a GPU: five episodes in three places, and in as many as there are."""
+    (one,) = train(short(steps=500), tmp_path / "one", lift="vmap", workers=1)
+    for at_once in (3, 9):
+        monkeypatch.setattr(trainee, "judged_at_once", lambda config, n=at_once: min(config.evaluation.episodes, n))
+        (many,) = train(short(steps=500), tmp_path / f"{at_once}", lift="vmap", workers=1)
+        for expected, row in zip(rows(one.path / "eval.csv"), rows(many.path / "eval.csv"), strict=True):
+            assert {name: float(value) for name, value in row.items() if value} == pytest.approx(
+                {name: float(value) for name, value in expected.items() if value}, rel=1e-3
+            )
 
 
 def test_programs_side_by_side_have_workers_of_their_own_which_step_during_the_update(

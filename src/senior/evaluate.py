@@ -10,7 +10,7 @@ import numpy as np
 from senior.envs.episodes import Episodes, Failure
 
 Policies = Callable[[Mapping[int, np.ndarray]], Mapping[int, np.ndarray]]
-"""Per run: observation [o] float32 -> action [a] in [-1, 1]."""
+"""Per run: observations [n, o] float32 -> actions [n, a] in [-1, 1], one for each of its n places."""
 
 
 class Episode(NamedTuple):
@@ -22,24 +22,15 @@ class Episode(NamedTuple):
     observations: np.ndarray  # [T, o] float32, after each action
 
 
-class _Judging:
-    """One run, on its way through its episodes."""
+class _Lived:
+    """One place, on its way through an episode."""
 
-    def __init__(self, place: Episodes, episodes: Sequence[int]) -> None:
+    def __init__(self, place: Episodes, episode: int) -> None:
         self.place = place
-        self.left = list(episodes)
-        self.judged: list[Episode] = []
-        self.failure: Failure | None = None
-        self._begin()
-
-    @property
-    def going_on(self) -> bool:
-        return self.failure is None and bool(self.left)
-
-    def _begin(self) -> None:
+        self.episode = episode
         self.total, self.success, self.actions, self.observations = 0.0, None, [], []
-        if self.left:
-            self.failure = self.place.begin(self.left[0])
+        self.failure = place.begin(episode)
+        self.over = False
 
     def receive(self, action: np.ndarray) -> None:
         """Count what ``action``, sent before, did."""
@@ -52,28 +43,72 @@ class _Judging:
         self.total += step.reward
         if step.success is not None:
             self.success = max(self.success or 0.0, step.success)
-        if step.ended:
-            lived = np.stack(self.actions), np.stack(self.observations)
-            self.judged.append(Episode(self.total, self.success, *lived))
-            del self.left[0]
-            self._begin()
+        self.over = step.ended
+
+    def judged(self) -> Episode:
+        return Episode(self.total, self.success, np.stack(self.actions), np.stack(self.observations))
+
+
+class _Judging:
+    """One run, on its way through its episodes, as many at a time as it has places."""
+
+    def __init__(self, places: Sequence[Episodes], episodes: Sequence[int]) -> None:
+        self.places = places
+        self.left = list(episodes)
+        self.judged: dict[int, Episode] = {}
+        self.failure: Failure | None = None
+        self.lived: dict[int, _Lived] = {}  # by place
+        for e in range(len(places)):
+            self._begin(e)
+
+    @property
+    def going_on(self) -> bool:
+        return self.failure is None and bool(self.lived)
+
+    @property
+    def observations(self) -> np.ndarray:
+        """[n, o]; of a place that is done, its last."""
+        return np.stack([place.observation for place in self.places])
+
+    def _begin(self, e: int) -> None:
+        self.lived.pop(e, None)
+        if self.left:
+            self.lived[e] = _Lived(self.places[e], self.left.pop(0))
+            self.failure = self.failure or self.lived[e].failure
+
+    def send(self, actions: np.ndarray) -> None:
+        for e in self.lived:
+            self.places[e].send(actions[e])
+
+    def receive(self, actions: np.ndarray) -> None:
+        """Count what ``actions``, sent before, did."""
+        for e, lived in list(self.lived.items()):
+            lived.receive(actions[e])
+            self.failure = self.failure or lived.failure
+            if lived.over:
+                self.judged[lived.episode] = lived.judged()
+                self._begin(e)
+
+    @property
+    def result(self) -> list[Episode] | Failure:
+        return self.failure or [self.judged[episode] for episode in sorted(self.judged)]
 
 
 def judge(
-    policies: Policies, places: Mapping[int, Episodes], episodes: Mapping[int, Sequence[int]]
+    policies: Policies, places: Mapping[int, Sequence[Episodes]], episodes: Mapping[int, Sequence[int]]
 ) -> dict[int, list[Episode] | Failure]:
-    """Bring every run's policy through its ``episodes`` in its place, all runs side by side.
+    """Bring every run's policy through its ``episodes``, all runs side by side, each in its places.
 
-    Per run its judged episodes, or what broke its environment.
+    Per run its judged episodes, in the order of their numbers, or what broke one of its environments.
     """
-    runs = {i: _Judging(place, episodes[i]) for i, place in places.items()}
+    runs = {i: _Judging(own, episodes[i]) for i, own in places.items()}
     while going_on := {i: run for i, run in runs.items() if run.going_on}:
-        actions = policies({i: run.place.observation for i, run in going_on.items()})
+        actions = policies({i: run.observations for i, run in going_on.items()})
         for i, run in going_on.items():
-            run.place.send(actions[i])
+            run.send(actions[i])
         for i, run in going_on.items():
             run.receive(actions[i])
-    return {i: run.failure or run.judged for i, run in runs.items()}
+    return {i: run.result for i, run in runs.items()}
 
 
 def summary(episodes: Sequence[Episode]) -> dict[str, float | int | None]:

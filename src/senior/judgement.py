@@ -53,7 +53,7 @@ def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None 
     place = Local(lambda: make_environment(config), config.seed, AFTERWARDS)
     try:
         episodes_of = {0: range(episodes)}
-        judged = evaluate.judge(lambda seen: {0: np.asarray(policy(actor, seen[0]))}, {0: place}, episodes_of)[0]
+        judged = evaluate.judge(lambda seen: {0: np.asarray(policy(actor, seen[0]))}, {0: [place]}, episodes_of)[0]
     finally:
         place.close()
     if isinstance(judged, Failure):

@@ -24,7 +24,7 @@ from senior.envs.episodes import Episodes, Failure, Step
 from senior.evaluate import judge, summary
 from senior.learner import Purpose, act, acting, actor_of, mean_action
 from senior.replay import Fact
-from senior.runs import PerRun, Proposal, Runs
+from senior.runs import Given, PerRun, Proposal, Runs
 from senior.schedule import Due, due
 from senior.trainee import Trainee
 
@@ -93,22 +93,15 @@ class Training:
         """Run from where the runs stand to their end, or until the watcher says stop."""
         last = self.last
         start = self.trainees[0].progress.step
+        plans, given = self.look_ahead(start, [None] * len(self.trainees))
         for step in range(start, last + 1):
             stop = self.watcher.stop
             self.look_back(step, stop or step == last)
             if stop or step == last or not self.active():
                 return
 
-            plans = [due(one.config, step, one.progress.queried, one.session_open) for one in self.trainees]
             with self.clock.part("act"):
-                actions = self.runs.look(
-                    acting,
-                    act,
-                    self.mask(),
-                    [trainee.environment.observation for trainee in self.trainees],
-                    [np.int32(step)] * len(plans),
-                    [np.bool_(plan.random) for plan in plans],
-                )
+                actions = self.runs.look(acting, act, self.mask(), given, "observation", "step", "random")
                 if self.waits:
                     jax.block_until_ready([actions[i] for i in self.active()])
             heard = {i for i in self.active() if step % LISTEN_EVERY == 0 and self.heard(i, step)}
@@ -124,7 +117,7 @@ class Training:
                     for i in self.active():
                         self.now_and_then(i, step, plans[i], i in heard)
             with self.clock.part("update"):
-                update = self.update(step, plans)
+                update = self.update(plans, given)
                 if self.waits:
                     self.wait(update)
             if not early:
@@ -132,12 +125,13 @@ class Training:
             if happened is None:
                 happened = self.receive(step)
             with self.clock.part("store"):
-                self.store(step, plans, happened, update)
+                following = self.store(step, plans, happened, update)
                 if self.waits:
                     self.wait()
             self.watcher.advance(step + 1, self.trainees)
             for i in self.active():
                 self.trainees[i].tell("pretraining" if plans[i].pretrain or plans[i].random else "training", step + 1)
+            plans, given = following
 
     def wait(self, update: Proposal | None = None) -> None:
         """Until the device has done everything asked of it, that update included."""
@@ -175,28 +169,51 @@ class Training:
                     happened[i] = result
         return happened
 
-    def update(self, step: int, plans: Sequence[Due]) -> Proposal | None:
+    def look_ahead(self, step: int, happened: Sequence[Step | None]) -> tuple[list[Due], Given]:
+        """What is due at ``step``, and what the device must know to store what ``happened`` and to take that step, on
+        its way there."""
+        trainees = self.trainees
+        plans = [due(one.config, step, one.progress.queried, one.session_open) for one in trainees]
+        given = self.runs.give(
+            fact=[_fact(trainee, one) for trainee, one in zip(trainees, happened, strict=True)],
+            observation=[trainee.environment.observation for trainee in trainees],
+            step=[np.int32(step)] * len(trainees),
+            random=[np.bool_(plan.random) for plan in plans],
+            recent=self.recent(),
+        )
+        return plans, given
+
+    def recent(self) -> list[np.int32]:
+        """Per run, how many of the latest rows a share of its batch is drawn from."""
+        return [np.int32(trainee.recent_rows()) for trainee in self.trainees]
+
+    def update(self, plans: Sequence[Due], given: Given) -> Proposal | None:
         """What the update would make of every run, on state entropy in pre-training, on rewards afterwards.
 
         All runs have one shape, which says when updates begin and of what kind they are.
         """
-        learner, steps = self.trainees[0].learner, [np.int32(step)] * len(plans)
+        learner = self.trainees[0].learner
         if plans[0].pretrain:
-            return self.runs.propose(learner.pretrain, ("agent", "deviation"), self.mask(), steps)
+            return self.runs.propose(learner.pretrain, ("agent", "deviation"), self.mask(), given, "step")
         if plans[0].update:
-            recent = [np.int32(trainee.recent_rows()) for trainee in self.trainees]
-            return self.runs.propose(learner.learn, ("agent",), self.mask(), steps, recent)
+            recent = self.recent()
+            if recent != given.columns["recent"]:  # an episode's end or a session came after
+                given = self.runs.give(**{**given.columns, "recent": recent})
+            return self.runs.propose(learner.learn, ("agent",), self.mask(), given, "step", "recent")
         return None
 
-    def store(self, step: int, plans: Sequence[Due], happened: Sequence[Step | None], update: Proposal | None) -> None:
-        """Let the update count, store what happened in every run, and count both."""
+    def store(
+        self, step: int, plans: Sequence[Due], happened: Sequence[Step | None], update: Proposal | None
+    ) -> tuple[list[Due], Given]:
+        """Let the update count, store what happened in every run, and count both; what is due at the next step."""
         learner, mask = self.trainees[0].learner, self.mask()
+        following, given = self.look_ahead(step + 1, happened)
         info = self.runs.accept(update, mask) if update else None
-        facts = [_fact(trainee, one) for trainee, one in zip(self.trainees, happened, strict=True)]
         if step < self.trainees[0].config.pretraining.until:
-            returns = self.runs.every(learner.store_pretraining, ("replay", "learned_return", "entropy"), mask, facts)
+            changed = "replay", "learned_return", "entropy"
+            returns = self.runs.every(learner.store_pretraining, changed, mask, given, "fact")
         else:
-            returns = self.runs.every(learner.store, ("replay", "learned_return"), mask, facts)
+            returns = self.runs.every(learner.store, ("replay", "learned_return"), mask, given, "fact")
         for i in self.active():
             one, plan, trainee = happened[i], plans[i], self.trainees[i]
             trainee.progress.pretraining_updates += plan.pretrain * trainee.config.pretraining.updates
@@ -207,6 +224,7 @@ class Training:
             trainee.record(step, one, returns[i] if one.ended else None, told)
             if {"beta", "intrinsic_mean"} <= told.keys() and trainee.progress.labels:
                 self.warn(i, "bonus", health.bonus_zero(float(told["beta"]), float(told["intrinsic_mean"])))
+        return following, given
 
     # Now and then, one run at a time.
 
@@ -291,16 +309,22 @@ class Training:
         """Judge the policies of some runs on fresh episodes; one whose environment breaks is stopped."""
         trainees = self.trainees
 
+        most = max(len(trainee.judged_in) for trainee in trainees)
+
         def policies(observations: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+            seen = np.zeros((len(trainees), most, trainees[0].spec.observation_size), np.float32)
+            for i, rows in observations.items():
+                seen[i, : len(rows)] = rows
             mask = [i in observations for i in range(len(trainees))]
-            seen = [observations.get(i, trainee.judged_in.observation) for i, trainee in enumerate(trainees)]
-            actions = self.runs.look(actor_of, mean_action, mask, seen)
+            given = self.runs.give(observation=list(seen))
+            actions = self.runs.look(actor_of, mean_action, mask, given, "observation")
             return {i: np.asarray(actions[i]) for i in observations}
 
         places = {i: trainees[i].judged_in for i in judged}
         found = judge(policies, places, {i: trainees[i].evaluation_episodes(step) for i in judged})
         for i, episodes in found.items():
-            self.note(i, places[i])
+            for place in places[i]:
+                self.note(i, place)
             if isinstance(episodes, Failure):
                 self.fail(i, step, episodes.message)
                 continue

@@ -12,7 +12,7 @@ import ctypes
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
@@ -33,6 +33,14 @@ class PerRun(Protocol):
     """Results of all runs; those of run ``i`` are ``results[i]``."""
 
     def __getitem__(self, i: int, /) -> Any: ...
+
+
+class Given(NamedTuple):
+    """Arguments of all runs by name, handed over once for all functions that take some of them."""
+
+    columns: Mapping[str, Sequence[Any]]  # one per run
+    packed: Any  # under vmap: the same on the device, a row per run
+    form: _Form | None
 
 
 class Proposal(NamedTuple):
@@ -72,16 +80,23 @@ class Runs:
             return pick(self._loop[i])
         return jax.tree.map(lambda leaf: leaf[i], pick(self._stack))  # pyright: ignore[reportArgumentType]
 
+    def give(self, **columns: Sequence[Any]) -> Given:
+        """Hand arguments over: each column holds one per run, of the host's numbers, arrays or named tuples of them."""
+        if self.lift == "loop":
+            return Given(columns, None, None)
+        packed, form = _pack(columns)
+        return Given(columns, jax.device_put(packed), form)
+
     def propose(
-        self, of_one: OfOneRun, changes: Sequence[str], active: Sequence[bool], *columns: Sequence[Any]
+        self, of_one: OfOneRun, changes: Sequence[str], active: Sequence[bool], given: Given, *names: str
     ) -> Proposal:
         """Compute a function for all active runs, and leave their states as they are until `accept`.
 
-        changes: the fields of `Run` that the function changes. Each column holds one argument per run.
+        changes: the fields of `Run` that the function changes. names: of the arguments that it takes.
         The device works on while this returns. Under vmap inactive runs are computed too and their results mean
         nothing.
         """
-        return self._propose(of_one, changes, False, active, columns)
+        return self._propose(of_one, changes, False, active, given, names)
 
     def accept(self, proposal: Proposal, active: Sequence[bool]) -> PerRun:
         """Put what was proposed into the states of the active runs; returns the function's results."""
@@ -96,10 +111,10 @@ class Runs:
         return proposal.results
 
     def every(
-        self, of_one: OfOneRun, changes: Sequence[str], active: Sequence[bool], *columns: Sequence[Any]
+        self, of_one: OfOneRun, changes: Sequence[str], active: Sequence[bool], given: Given, *names: str
     ) -> PerRun:
         """`propose` and `accept` in one, in the arrays that the states have."""
-        return self.accept(self._propose(of_one, changes, True, active, columns), active)
+        return self.accept(self._propose(of_one, changes, True, active, given, names), active)
 
     def _propose(
         self,
@@ -107,18 +122,18 @@ class Runs:
         changes: Sequence[str],
         donate: bool,
         active: Sequence[bool],
-        columns: Sequence[Sequence[Any]],
+        given: Given,
+        names: tuple[str, ...],
     ) -> Proposal:
         if self.lift == "vmap":
             assert self._stack is not None
-            packed, form = _pack(columns)
-            function = compiled(of_one, self.lift, tuple(changes), donate, form)
-            return Proposal(changes, *function(*_part(self._stack, changes), packed))
+            function = compiled(of_one, self.lift, tuple(changes), donate, given.form, names)
+            return Proposal(changes, *function(*_part(self._stack, changes), given.packed))
         function = compiled(of_one, self.lift, tuple(changes), donate)
         fields, results = [None] * self.size, [None] * self.size
         for i, state in enumerate(self._loop):
             if active[i]:
-                arguments = (column[i] for column in columns)
+                arguments = (given.columns[name][i] for name in names)
                 fields[i], results[i] = function(*_part(state, changes), *arguments)
         return Proposal(changes, fields, results)
 
@@ -127,16 +142,16 @@ class Runs:
         pick: Callable[[Run], Any],
         of_part: Callable[..., Any],
         active: Sequence[bool],
-        *columns: Sequence[Any],
+        given: Given,
+        *names: str,
     ) -> PerRun:
         """Call a function of a part of the state, which it leaves as it is, for all active runs."""
         if self.lift == "vmap":
-            packed, form = _pack(columns)
-            function = compiled(of_part, self.lift, None, False, form)
-            return _Stacked(function(pick(self._stack), packed))  # pyright: ignore[reportArgumentType]
+            function = compiled(of_part, self.lift, None, False, given.form, names)
+            return _Stacked(function(pick(self._stack), given.packed))  # pyright: ignore[reportArgumentType]
         function = compiled(of_part, self.lift, None, donate=False)
         return [
-            function(pick(state), *(column[i] for column in columns)) if active[i] else None
+            function(pick(state), *(given.columns[name][i] for name in names)) if active[i] else None
             for i, state in enumerate(self._loop)
         ]
 
@@ -156,8 +171,8 @@ class _Form(NamedTuple):
     tree: Any
     leaves: tuple[tuple[tuple[int, ...], np.dtype], ...]  # shape and type
 
-    def take_apart(self, row: jax.Array) -> Any:
-        """The arguments that lie in a row; traced."""
+    def take_apart(self, row: jax.Array) -> dict[str, Any]:
+        """The arguments that lie in a row, by name; traced."""
         ends = np.cumsum([int(np.prod(shape)) for shape, _ in self.leaves])
         leaves = []
         for words, (shape, kind) in zip(jnp.split(row, ends[:-1]), self.leaves, strict=True):
@@ -166,13 +181,14 @@ class _Form(NamedTuple):
         return jax.tree.unflatten(self.tree, leaves)
 
 
-def _pack(columns: Sequence[Sequence[Any]]) -> tuple[np.ndarray, _Form]:
-    """Arguments of all runs, a column or more of the host's numbers, arrays or named tuples of them, as one array with
-    a row per run: whatever goes to a GPU by itself costs half a millisecond or more, however small it is."""
+def _pack(columns: Mapping[str, Sequence[Any]]) -> tuple[np.ndarray, _Form]:
+    """Arguments of all runs as one array with a row per run: whatever goes to a GPU by itself costs half a millisecond
+    or more, however small it is."""
     leaves: list[np.ndarray] = []
-    for column in columns:
+    for name in sorted(columns):  # the order of JAX's leaves
+        column = columns[name]
         leaves += map(np.array, zip(*column, strict=True) if isinstance(column[0], tuple) else [column])
-    tree = jax.tree.structure([column[0] for column in columns])
+    tree = jax.tree.structure({name: column[0] for name, column in columns.items()})
     form = _Form(tree, tuple((leaf.shape[1:], leaf.dtype) for leaf in leaves))
     return np.concatenate([_words(leaf) for leaf in leaves], axis=1), form
 
@@ -191,25 +207,27 @@ def compiled(
     changes: tuple[str, ...] | Literal["all"] | None,
     donate: bool,
     form: _Form | None = None,
+    names: tuple[str, ...] = (),
 ) -> Any:
     """A function of one run, lifted and compiled. The same function is the same program for all that use it.
 
     changes: fields of every run that it changes; "all": it may change everything of the one run it is called for;
-    None: it changes nothing. form: how the arguments after the state are packed, if they are.
+    None: it changes nothing. form: how arguments are packed, if they are; names: of those that it takes.
     """
     if changes == "all":
         function = of_one if lift == "loop" else _at(of_one)
     else:
         function = _of_part(of_one, changes) if changes else of_one
-        function = _of_row(function, form) if form else function
+        function = _of_row(function, form, names) if form else function
         function = function if lift == "loop" else jax.vmap(function)
     return jax.jit(function, donate_argnums=0 if donate else ())
 
 
-def _of_row(function: Callable[..., Any], form: _Form) -> Callable[..., Any]:
+def _of_row(function: Callable[..., Any], form: _Form, names: tuple[str, ...]) -> Callable[..., Any]:
     def call(*states_and_row: Any) -> Any:
         *states, row = states_and_row
-        return function(*states, *form.take_apart(row))
+        given = form.take_apart(row)
+        return function(*states, *(given[name] for name in names))
 
     return call
 

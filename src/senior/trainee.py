@@ -23,6 +23,9 @@ from senior.reward.model import Labelled
 from senior.rundir import RunDirectory, told
 from senior.types import BadInput, EnvSpec, Pairs
 
+JUDGED_AT_ONCE = 10
+"""Most episodes of one evaluation on a GPU, which waits for each of their steps, that are lived side by side."""
+
 
 @dataclass
 class Progress:
@@ -62,6 +65,14 @@ def make_environment(config: Config) -> tuple[Any, EnvSpec]:
     return envs.make(**made_by(config))
 
 
+def judged_at_once(config: Config) -> int:
+    """How many episodes of an evaluation are lived side by side, each in an environment of its own.
+
+    On a CPU one: more would take memory, win little, and give other last bits.
+    """
+    return min(config.evaluation.episodes, JUDGED_AT_ONCE) if config.device == "gpu" else 1
+
+
 class Trainee:
     """One run, as its host sees it. `begin` or `resume` gives it its state."""
 
@@ -78,7 +89,7 @@ class Trainee:
         self.done = False
         self.filmed = self._must_be_filmed()
         self.environment = self._film() if self.filmed else self._place(TRAINING, worker)
-        self.judged_in = self._place(EVALUATION, worker)
+        self.judged_in = [self._place(EVALUATION, worker) for _ in range(judged_at_once(config))]
         self.rule = parts.selection(config) if config.method.learns_reward else None
         self.teacher = parts.teacher(config)
         self.rules = config.asking.rules
@@ -251,7 +262,8 @@ class Trainee:
     def close(self) -> None:
         """Close environments and files."""
         self.environment.close()
-        self.judged_in.close()
+        for place in self.judged_in:
+            place.close()
         self.directory.close()
         if self._preferences is not None:
             self._preferences.close()
