@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -289,7 +290,7 @@ def test_a_damaged_configuration(command: str, text: str, capsys: pytest.Capture
 def test_what_is_no_run(capsys: pytest.CaptureFixture[str]):
     Path("empty").mkdir()
     Path("file").write_text("no directory")
-    for command in ("resume", "eval"):
+    for command in ("resume", "eval", "labels stats"):
         for path in ("empty", "file", "nowhere"):
             assert f"There is no run in {path}" in refused(f"{command} {path}", capsys)
     for seed in (0, 1):
@@ -297,6 +298,7 @@ def test_what_is_no_run(capsys: pytest.CaptureFixture[str]):
         about = {"config": to_json(preset("quick", "point", "m-senior")), "protocol": {}}
         Path(f"early/seed-{seed}/config.json").write_text(json.dumps(about))
     assert "has not reached its first checkpoint" in refused("eval early/seed-0", capsys)
+    assert "There are 2 runs under early; name one of them." in refused("labels stats early", capsys)
     assert "--episodes must be at least 1, not 0" in refused("eval early/seed-0 --episodes 0", capsys)
     assert "--episodes needs a whole number, not 'x'" in refused("eval early/seed-0 --episodes x", capsys)
     assert "--video films one run" in refused("eval early --video film.mp4", capsys)
@@ -306,6 +308,8 @@ def test_what_is_no_run(capsys: pytest.CaptureFixture[str]):
     Path("early/seed-0/policy").mkdir()
     Path("early/seed-0/policy/actor.npz").write_bytes(b"PK no archive")
     assert "early/seed-0 cannot be read" in refused("eval early/seed-0", capsys)
+    shutil.rmtree("early/seed-1")
+    assert "early/seed-0 has no labels" in refused("labels stats early", capsys)
 
 
 def test_the_reward_of_meta_world_is_the_dense_one():

@@ -231,15 +231,17 @@ class Answering:
     """The five numbers of a scripted teacher (B-Pref). Left out: those of the named teacher, else a perfect one's."""
 
     rationality: float | None = None
-    """Inverse temperature of random answers; -1: always the better one (beta)."""
+    """Inverse temperature of random answers; -1: always the better one (beta). Left out: the teacher's."""
     foresight: float | None = None
-    """Discount that weighs a segment's earlier steps less; 1: all alike (gamma)."""
+    """Discount that weighs a segment's earlier steps less; 1: all alike (gamma). Left out: the teacher's."""
     mistake: float | None = None
-    """Probability of the opposite answer (epsilon_mistake)."""
+    """Probability of the opposite answer (epsilon_mistake). Left out: the teacher's."""
     skip: float | None = None
-    """Pairs whose better segment earns less than this share of the recent average are skipped (epsilon_skip)."""
+    """Pairs whose better segment earns less than this share of the recent average are skipped (epsilon_skip).
+    Left out: the teacher's."""
     equal: float | None = None
-    """Pairs that differ by less than this share of the recent average are called equal (epsilon_equal)."""
+    """Pairs that differ by less than this share of the recent average are called equal (epsilon_equal).
+    Left out: the teacher's."""
 
 
 @dataclass(frozen=True)

@@ -211,7 +211,7 @@ def resume(
     """
     _check_machine(workers, runs_per_device)
     watcher = watcher or Quiet()
-    found = find_runs(path)
+    found = rundir.find_runs(path)
     with ExitStack() as stack:
         pools: Pools | None = None
         device = wanted = ""
@@ -250,18 +250,6 @@ def _is_over(run: Path) -> bool:
         return next(iter(rundir.saved_steps(run / "checkpoints")), -1) >= load(run / "config.json").steps
     except BadInput:
         return False
-
-
-def find_runs(path: Path | str) -> list[Path]:
-    """The run directories at or under a path, in order; `BadInput` if there is none."""
-    path = Path(path)
-    with rundir.told(path):
-        if (path / "config.json").is_file():
-            return [path]
-        found = sorted(file.parent for file in path.glob("**/config.json") if rundir.is_run(file.parent))
-    if not found:
-        raise BadInput(f"There is no run in {path}: no config.json of a run at or below it.")
-    return found
 
 
 def make_learner(config: Config, spec: EnvSpec | None = None) -> Learner:

@@ -256,6 +256,26 @@ def is_run(path: Path) -> bool:
     return isinstance(content, dict) and {"config", "protocol"} <= content.keys()
 
 
+def find_runs(path: Path | str) -> list[Path]:
+    """The run directories at or under a path, in order; `BadInput` if there is none."""
+    path = Path(path)
+    with told(path):
+        if (path / "config.json").is_file():
+            return [path]
+        found = sorted(file.parent for file in path.glob("**/config.json") if is_run(file.parent))
+    if not found:
+        raise BadInput(f"There is no run in {path}: no config.json of a run at or below it.")
+    return found
+
+
+def only_run(path: Path | str) -> Path:
+    """The run directory at or under a path; `BadInput` if there is none, or several."""
+    found = find_runs(path)
+    if len(found) > 1:
+        raise BadInput(f"There are {len(found)} runs under {path}; name one of them.")
+    return found[0]
+
+
 def saved_steps(checkpoints: Path) -> list[int]:
     """Steps at which there are checkpoints in that folder of a run, newest first."""
     found = (_CHECKPOINT.fullmatch(path.name) for path in checkpoints.glob("step-*.npz"))

@@ -53,9 +53,9 @@ class BenchOptions:
 
 def evaluate(arguments: list[str]) -> int:
     options = parse(EvalOptions, arguments, None, "eval")
-    from senior import judgement, program
+    from senior import judgement, rundir
 
-    found = program.find_runs(options.run)
+    found = rundir.find_runs(options.run)
     if options.video and len(found) > 1:
         raise BadInput(f"--video films one run, and there are {len(found)} under {options.run}; name one of them.")
     judgement.check_asked(options.episodes, options.video)

@@ -14,6 +14,7 @@ import tyro
 from senior.cli.shared import DONE, PageOptions
 from senior.label.serving import check_installed
 from senior.options import parse
+from senior.rundir import only_run
 from senior.types import BadInput
 
 
@@ -22,7 +23,7 @@ class LabelOptions:
     """Serve the labelling page of a run that people teach, without training it."""
 
     run: tyro.conf.Positional[Path]
-    """A run directory."""
+    """A run directory, or one above it."""
     page: Annotated[PageOptions, tyro.conf.arg(name="")] = field(default_factory=PageOptions)
 
 
@@ -31,7 +32,7 @@ class ExportOptions:
     """Write all that was asked in a run and said of it into files (docs/labels.md)."""
 
     run: tyro.conf.Positional[Path]
-    """A run directory."""
+    """A run directory, or one above it."""
     out: Path
     """File to write, NAME.jsonl; the segments go to NAME.npz beside it."""
 
@@ -41,7 +42,7 @@ class ImportOptions:
     """Put exported labels into a run of people's that has not asked anything yet."""
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """A run directory."""
+    """A run directory, or one above it."""
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """NAME.jsonl, with NAME.npz beside it."""
 
@@ -51,7 +52,7 @@ class StatsOptions:
     """Tell who said what in a run, and how far people agree."""
 
     run: tyro.conf.Positional[Path]
-    """A run directory."""
+    """A run directory, or one above it."""
     json: bool = False
     """Print JSON."""
 
@@ -59,13 +60,9 @@ class StatsOptions:
 def label(arguments: list[str]) -> int:
     options = parse(LabelOptions, arguments, None, "label")
     check_installed()
-    from senior import program
     from senior.label import server
 
-    found = program.find_runs(options.run)
-    if len(found) > 1:
-        raise BadInput(f"There are {len(found)} runs under {options.run}; name one of them.")
-    served = server.serve(found[0], options.page.address(), "user")
+    served = server.serve(only_run(options.run), options.page.address(), "user")
     if served.process != os.getpid():
         print(f"The run is served already: {served.url}")
     return DONE
@@ -85,7 +82,7 @@ def _export(arguments: list[str]) -> int:
     options = parse(ExportOptions, arguments, None, "labels export")
     from senior import labels
 
-    count = labels.export_labels(options.run, options.out)
+    count = labels.export_labels(only_run(options.run), options.out)
     print(f"{count} pairs: {options.out} and {options.out.with_suffix('.npz')}")
     return DONE
 
@@ -94,7 +91,8 @@ def _import(arguments: list[str]) -> int:
     options = parse(ImportOptions, arguments, None, "labels import")
     from senior import labels
 
-    print(f"{labels.import_into(options.run, options.file)} pairs taken over into {options.run}")
+    run = only_run(options.run)
+    print(f"{labels.import_into(run, options.file)} pairs taken over into {run}")
     return DONE
 
 
@@ -103,6 +101,6 @@ def _stats(arguments: list[str]) -> int:
     check_installed()
     from senior import labels
 
-    found = labels.stats(options.run)
+    found = labels.stats(only_run(options.run))
     print(json.dumps(found, indent=2) if options.json else labels.describe(found))
     return DONE

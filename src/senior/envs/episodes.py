@@ -8,8 +8,10 @@ environment, bit for bit, which is how runs are resumed, dead workers replaced a
 from __future__ import annotations
 
 import contextlib
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium
@@ -176,12 +178,18 @@ class Local:
         return None
 
     def _fail(self, error: Exception) -> Failure:
-        cause = str(error) if isinstance(error, _BadNumber) else f"{type(error).__name__}: {error}"
+        cause = str(error) if isinstance(error, _BadNumber) else f"{type(error).__name__}: {error}{_raised_at(error)}"
         self.failure = Failure(
             f"The environment {self.spec.name} of seed {self.seed} failed in episode "
             f"{self.episode} after step {self.elapsed}: {' '.join(cause.split())}"
         )
         return self.failure
+
+
+def _raised_at(error: BaseException) -> str:
+    """Where an error came from, for whoever wrote the environment."""
+    frames = traceback.extract_tb((error.__cause__ or error).__traceback__)
+    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
 
 class _BadNumber(Exception):
