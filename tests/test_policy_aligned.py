@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +14,11 @@ import pytest
 
 from senior import replay
 from senior.fit import spec_of
-from senior.program import make_learner
+from senior.loop import Training
+from senior.program import make_learner, train
 from senior.reward.model import Snippets, window_sums
+from senior.runs import Given, Proposal, Runs
+from senior.schedule import Due
 from senior.trainee import Trainee
 from senior.types import Source
 from tests.small import small
@@ -79,6 +84,33 @@ def test_the_window_is_the_latest_episodes_long_and_closes_with_the_budget(tmp_p
         trainee.progress.episode = 9
         assert trainee.recent_rows() == 0
         trainee.close()
+
+
+def test_every_update_draws_from_the_window_as_it_is_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """It is handed over a step before; an episode's end and the last session change it in between."""
+    drawn: list[tuple[int, int]] = []
+    update = Training.update
+
+    def noted(training: Training, plans: Sequence[Due], given: Given) -> Proposal | None:
+        proposed = update(training, plans, given)
+        if plans[0].update:
+            drawn.append((used[-1], training.trainees[0].recent_rows()))
+        return proposed
+
+    used: list[int] = []
+    propose = Runs.propose
+
+    def seen(runs: Runs, of_one: Any, changes: Any, active: Any, given: Given, *names: str) -> Proposal:
+        used.append(int(given.columns["recent"][0]))
+        return propose(runs, of_one, changes, active, given, *names)
+
+    monkeypatch.setattr(Training, "update", noted)
+    monkeypatch.setattr(Runs, "propose", seen)
+    config = small("qpa", steps=900)
+    config = replace(config, qpa=replace(config.qpa, episodes=12), queries=replace(config.queries, budget=25))
+    train(config, tmp_path)
+    assert [used for used, _ in drawn] == [now for _, now in drawn]
+    assert {now for _, now in drawn} == {0, *range(400, 601, 50)}  # growing, full, and closed with the budget
 
 
 def test_candidates_come_from_its_own_episodes_alone(tmp_path: Path):

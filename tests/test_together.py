@@ -18,7 +18,7 @@ from senior.learner import Learner
 from senior.loop import Training
 from senior.methods import METHODS
 from senior.presets import preset, release
-from senior.program import Quiet, make_learner, resume, train, train_all
+from senior.program import Quiet, make_learner, resume, train_all
 from senior.replay import Fact
 from senior.reward.bilevel import FirstSteps
 from senior.reward.model import Labelled
@@ -195,15 +195,31 @@ def test_under_vmap_a_run_depends_neither_on_its_neighbour_nor_on_the_program_be
 def test_episodes_judged_side_by_side_are_those_judged_one_after_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """As on a GPU: five episodes in three places, and in as many as there are."""
-    (one,) = train(short(steps=500), tmp_path / "one", lift="vmap", workers=1)
-    for at_once in (3, 9):
-        monkeypatch.setattr(trainee, "judged_at_once", lambda config, n=at_once: min(config.evaluation.episodes, n))
-        (many,) = train(short(steps=500), tmp_path / f"{at_once}", lift="vmap", workers=1)
-        for expected, row in zip(rows(one.path / "eval.csv"), rows(many.path / "eval.csv"), strict=True):
-            assert {name: float(value) for name, value in row.items() if value} == pytest.approx(
-                {name: float(value) for name, value in expected.items() if value}, rel=1e-3
-            )
+    """As on a GPU, in three places: five episodes of one run beside two of the other."""
+    runs = {"a": short(steps=500), "b": replace(other(), steps=500)}
+
+    def evaluations(folder: str) -> dict[str, list[dict[str, float]]]:
+        train_all([(run, tmp_path / folder / name) for name, run in runs.items()], Said(), lift="vmap", workers=1)
+        read = {name: rows(tmp_path / folder / name / "eval.csv") for name in runs}
+        return {name: [{k: float(v) for k, v in row.items() if v} for row in read[name]] for name in runs}
+
+    expected = evaluations("one after the other")
+    monkeypatch.setattr(trainee, "judged_at_once", lambda device: 3)
+    shapes = set[Any]()
+    plain = together.Runs.give
+
+    def noted(self: Any, **columns: Any) -> Any:
+        if list(columns) == ["observation"]:
+            shapes.add(np.shape(columns["observation"]))
+        return plain(self, **columns)
+
+    monkeypatch.setattr(together.Runs, "give", noted)
+    found = evaluations("side by side")
+    assert shapes == {(2, 3, 4)}
+    for name in runs:
+        assert [row["episodes"] for row in found[name]] == [row["episodes"] for row in expected[name]]
+        for row, one in zip(found[name], expected[name], strict=True):
+            assert row == pytest.approx(one, rel=1e-3)
 
 
 def test_programs_side_by_side_have_workers_of_their_own_which_step_during_the_update(

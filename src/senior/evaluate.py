@@ -1,4 +1,4 @@
-"""Judge a policy on episodes of its own, in an environment of its own, with the mean action."""
+"""Judge a policy on episodes of its own, in environments of its own, with the mean action."""
 
 from __future__ import annotations
 
@@ -59,7 +59,8 @@ class _Judging:
         self.failure: Failure | None = None
         self.lived: dict[int, _Lived] = {}  # by place
         for e in range(len(places)):
-            self._begin(e)
+            if self.failure is None:
+                self._begin(e)
 
     @property
     def going_on(self) -> bool:
@@ -74,20 +75,22 @@ class _Judging:
         self.lived.pop(e, None)
         if self.left:
             self.lived[e] = _Lived(self.places[e], self.left.pop(0))
-            self.failure = self.failure or self.lived[e].failure
+            self.failure = self.lived[e].failure
 
     def send(self, actions: np.ndarray) -> None:
         for e in self.lived:
             self.places[e].send(actions[e])
 
     def receive(self, actions: np.ndarray) -> None:
-        """Count what ``actions``, sent before, did."""
+        """Count what ``actions``, sent before, did; after a failure nothing is waited for any more."""
         for e, lived in list(self.lived.items()):
             lived.receive(actions[e])
-            self.failure = self.failure or lived.failure
+            self.failure = lived.failure
             if lived.over:
                 self.judged[lived.episode] = lived.judged()
                 self._begin(e)
+            if self.failure is not None:
+                return
 
     @property
     def result(self) -> list[Episode] | Failure:

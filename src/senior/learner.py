@@ -321,7 +321,7 @@ def actor_of(run: Run) -> MLP:
     return run.agent.actor
 
 
-def mean_action(actor: MLP, observation: Float[Array, " o"]) -> Float[Array, " a"]:
+def mean_action(actor: MLP, observation: Float[Array, "*b o"]) -> Float[Array, "*b a"]:
     """The action that evaluation takes."""
     return sac.mean_action(actor, observation)
 

@@ -125,13 +125,14 @@ class Training:
             if happened is None:
                 happened = self.receive(step)
             with self.clock.part("store"):
-                following = self.store(step, plans, happened, update)
+                ahead, given = self.look_ahead(step + 1, happened)
+                self.store(step, plans, happened, update, given)
                 if self.waits:
                     self.wait()
             self.watcher.advance(step + 1, self.trainees)
             for i in self.active():
                 self.trainees[i].tell("pretraining" if plans[i].pretrain or plans[i].random else "training", step + 1)
-            plans, given = following
+            plans = ahead
 
     def wait(self, update: Proposal | None = None) -> None:
         """Until the device has done everything asked of it, that update included."""
@@ -170,8 +171,8 @@ class Training:
         return happened
 
     def look_ahead(self, step: int, happened: Sequence[Step | None]) -> tuple[list[Due], Given]:
-        """What is due at ``step``, and what the device must know to store what ``happened`` and to take that step, on
-        its way there."""
+        """What is due at ``step``, and what the device must know to store what ``happened`` before and to take that
+        step: it is being sent already."""
         trainees = self.trainees
         plans = [due(one.config, step, one.progress.queried, one.session_open) for one in trainees]
         given = self.runs.give(
@@ -203,11 +204,15 @@ class Training:
         return None
 
     def store(
-        self, step: int, plans: Sequence[Due], happened: Sequence[Step | None], update: Proposal | None
-    ) -> tuple[list[Due], Given]:
-        """Let the update count, store what happened in every run, and count both; what is due at the next step."""
+        self,
+        step: int,
+        plans: Sequence[Due],
+        happened: Sequence[Step | None],
+        update: Proposal | None,
+        given: Given,
+    ) -> None:
+        """Let the update count, store what happened in every run, which was ``given``, and count both."""
         learner, mask = self.trainees[0].learner, self.mask()
-        following, given = self.look_ahead(step + 1, happened)
         info = self.runs.accept(update, mask) if update else None
         if step < self.trainees[0].config.pretraining.until:
             changed = "replay", "learned_return", "entropy"
@@ -224,7 +229,6 @@ class Training:
             trainee.record(step, one, returns[i] if one.ended else None, told)
             if {"beta", "intrinsic_mean"} <= told.keys() and trainee.progress.labels:
                 self.warn(i, "bonus", health.bonus_zero(float(told["beta"]), float(told["intrinsic_mean"])))
-        return following, given
 
     # Now and then, one run at a time.
 
@@ -308,11 +312,10 @@ class Training:
     def evaluate(self, judged: Sequence[int], step: int) -> None:
         """Judge the policies of some runs on fresh episodes; one whose environment breaks is stopped."""
         trainees = self.trainees
-
-        most = max(len(trainee.judged_in) for trainee in trainees)
+        shape = len(trainees), trainees[0].at_once, trainees[0].spec.observation_size  # whoever is beside a run
 
         def policies(observations: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
-            seen = np.zeros((len(trainees), most, trainees[0].spec.observation_size), np.float32)
+            seen = np.zeros(shape, np.float32)
             for i, rows in observations.items():
                 seen[i, : len(rows)] = rows
             mask = [i in observations for i in range(len(trainees))]
@@ -385,7 +388,7 @@ class Training:
 
 
 def _fact(trainee: Trainee, happened: Step | None) -> Fact:
-    """A transition for the device; of a stopped run, anything of the right shape."""
+    """A transition for the device; where nothing happened, anything of the right shape."""
     if happened is None:
         o, a = trainee.spec.observation_size, trainee.spec.action_size
         nothing = np.zeros(o, np.float32)

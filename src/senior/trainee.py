@@ -24,7 +24,7 @@ from senior.rundir import RunDirectory, told
 from senior.types import BadInput, EnvSpec, Pairs
 
 JUDGED_AT_ONCE = 10
-"""Most episodes of one evaluation on a GPU, which waits for each of their steps, that are lived side by side."""
+"""Most episodes of one evaluation that a GPU, which waits for each of their steps, judges side by side."""
 
 
 @dataclass
@@ -65,12 +65,12 @@ def make_environment(config: Config) -> tuple[Any, EnvSpec]:
     return envs.make(**made_by(config))
 
 
-def judged_at_once(config: Config) -> int:
-    """How many episodes of an evaluation are lived side by side, each in an environment of its own.
+def judged_at_once(device: str) -> int:
+    """How many episodes of an evaluation are lived side by side at most, each in an environment of its own.
 
     On a CPU one: more would take memory, win little, and give other last bits.
     """
-    return min(config.evaluation.episodes, JUDGED_AT_ONCE) if config.device == "gpu" else 1
+    return JUDGED_AT_ONCE if device == "gpu" else 1
 
 
 class Trainee:
@@ -89,7 +89,9 @@ class Trainee:
         self.done = False
         self.filmed = self._must_be_filmed()
         self.environment = self._film() if self.filmed else self._place(TRAINING, worker)
-        self.judged_in = [self._place(EVALUATION, worker) for _ in range(judged_at_once(config))]
+        self.at_once = judged_at_once(config.device)
+        places = min(config.evaluation.episodes, self.at_once)
+        self.judged_in = [self._place(EVALUATION, worker) for _ in range(places)]
         self.rule = parts.selection(config) if config.method.learns_reward else None
         self.teacher = parts.teacher(config)
         self.rules = config.asking.rules

@@ -187,9 +187,15 @@ class Local:
 
 
 def _raised_at(error: BaseException) -> str:
-    """Where an error came from, for whoever wrote the environment."""
-    frames = traceback.extract_tb((error.__cause__ or error).__traceback__)
-    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    """Where outside of this package an error came from, for whoever wrote the environment; empty if inside of it."""
+    ours = Path(__file__).parents[1]
+    for raised in filter(None, (error, error.__cause__)):
+        frames = [
+            frame for frame in traceback.extract_tb(raised.__traceback__) if ours not in Path(frame.filename).parents
+        ]
+        if frames:
+            return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})"
+    return ""
 
 
 class _BadNumber(Exception):
