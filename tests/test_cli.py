@@ -140,6 +140,8 @@ NUMBERS = {
     "--rune.beta -1": "--rune.beta must be 0 or more",
     "--qpa.episodes 1": "--qpa.episodes must be at least 2",
     "--qpa.share 1.5": "--qpa.share must lie between 0 and 1",
+    "--method p-senior --pge.share 0.001": "--pge.share 0.001 of a batch of 512 is not one row",
+    "--method qpa --qpa.share 0": "--qpa.share 0 of a batch of 512 is not one row",
     "--rationality 0": "--rationality must be a positive number, or -1",
     "--mistake 1.5": "--mistake must lie between 0 and 1",
     "--foresight nan": "--foresight must lie between 0 and 1",

@@ -215,6 +215,24 @@ def test_a_session_is_put_off_while_the_one_before_it_is_not_answered(tmp_path: 
     assert [row[:3] for row in labels(tmp_path / "seed-0")] == [(0, 400, 400)] * 10 + [(1, 600, None)] * 10
 
 
+def test_until_there_is_a_label_every_session_is_waited_for(tmp_path: Path):
+    asked = count()
+
+    def slow_to_tell(returns: np.ndarray) -> Side:
+        number = next(asked)
+        if number == 10:
+            time.sleep(1.5)  # in which a run that does not wait takes some hundred steps
+        return "skip" if number < 10 else better(returns)
+
+    watcher = Stop()
+    with person(tmp_path / "seed-0", slow_to_tell):
+        (result,) = train(taught(wait=False), tmp_path, watcher=watcher)
+    assert result.labels == 15
+    found = labels(tmp_path / "seed-0")
+    assert {(session, at, learned) for session, at, learned, _ in found[:20]} == {(0, 400, 400), (1, 600, 600)}
+    assert [said for said in watcher.said if "waits for answers at step 600" in said]
+
+
 def test_skips_spend_the_budget_unless_they_are_replaced(tmp_path: Path):
     def fussy(returns: np.ndarray) -> Side:
         return "skip" if int(1000 * returns.sum()) % 3 == 0 else better(returns)

@@ -157,6 +157,14 @@ def check(config: Config) -> Config:
             config.reward.members > 1 or value not in ("disagreement", "kcenter_disagreement"),
             f"One member cannot disagree with itself, so {cell} {value} needs --reward.members 2 or more.",
         )
+    for mix, name, share in (
+        ("curiosity", "--pge.share", config.pge.share),
+        ("recent", "--qpa.share", config.qpa.share),
+    ):
+        _require(
+            row.mix != mix or int(share * config.sac.batch) > 0,
+            f"{name} {share:g} of a batch of {config.sac.batch} is not one row; raise it or use --mix uniform.",
+        )
     if row.outer == "bilevel" and config.bilevel.batch == "update":
         _require(
             row.mix != "recent" and (row.mix != "curiosity" or not config.pge.refresh_with_outer),

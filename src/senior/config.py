@@ -250,7 +250,7 @@ class Asking:
 
     wait: bool = True
     """Wait for all answers to a session, as the paper does; else train on meanwhile, and ask again when all have come.
-    The first session is always waited for: without it there is nothing to learn from."""
+    Until there is a label every session is waited for: there is nothing to learn from."""
     overlap: int = 1
     """How many people are asked about each pair. It costs one of the budget, and is trained on by their mean answer."""
     replace_skipped: bool = False

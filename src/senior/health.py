@@ -46,7 +46,7 @@ def success_falls(success: Sequence[float], learned_return: Sequence[float]) -> 
     if len(success) < 3:
         return None
     best = max(range(len(success)), key=lambda i: success[i])
-    if success[best] - max(success[-2:]) < FALL or learned_return[-1] <= learned_return[best]:
+    if success[best] - max(success[-2:]) < FALL - 1e-9 or learned_return[-1] <= learned_return[best]:
         return None
     return (
         f"Success has fallen from {success[best]:.0%} to {success[-1]:.0%} while the learned return rose from "

@@ -37,7 +37,7 @@ def hold(
     if not ask(trainee, runs, i, step, n, warn):
         return None
     refused, first = listen(trainee), True
-    must_wait = trainee.config.asking.wait or trainee.progress.collected == 0
+    must_wait = trainee.config.asking.wait or not trainee.progress.labels
     while not refused and not (trainee.answered(step, must_wait) and learn(trainee, runs, i, step, warn)):
         if not must_wait:
             return None
