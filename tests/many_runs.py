@@ -22,7 +22,8 @@ from senior.files import pack
 from senior.methods import METHODS
 from senior.preference_file import SCHEMA, SCHEMA_VERSION
 from senior.presets import PAPER, preset
-from senior.rundir import EVAL, PACKAGES, TIMING, TRAIN
+from senior.protocol import PACKAGES
+from senior.rundir import EVAL, TIMING, TRAIN
 
 FILES = ("eval.csv", "train.csv", "timing.csv", "preferences.sqlite", "positions.npz", "bonus")
 EPISODE, OBSERVATION, ACTION = 500, 39, 4

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import errno
 import json
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 from dataclasses import replace
@@ -312,6 +314,20 @@ def test_what_is_no_run(capsys: pytest.CaptureFixture[str]):
     assert "early/seed-0 cannot be read" in refused("eval early/seed-0", capsys)
     shutil.rmtree("early/seed-1")
     assert "early/seed-0 has no labels" in refused("labels stats early", capsys)
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "No space left on device"), sqlite3.OperationalError("database or disk is full")]
+)
+def test_a_full_disk_is_told_in_a_sentence(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def full(*_: Any, **__: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(program, "train", full)
+    assert main(["train", "--task", "point", "--preset", "quick"]) == FAILED
+    assert capsys.readouterr().err == f"senior: {error}. What was saved is kept.\n"
 
 
 def test_the_reward_of_meta_world_is_the_dense_one():

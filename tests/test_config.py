@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from senior import bench, envs, rundir
+from senior import bench, envs, protocol
 from senior.checks import check
 from senior.config import SAC, Config, Queries, differences, from_json, load, to_json
 from senior.methods import METHODS, Method
@@ -177,10 +177,10 @@ def test_a_run_tells_the_commit_of_its_source_and_whether_it_was_changed(
         ).stdout.strip()
 
     def told() -> str | None:
-        return rundir.protocol(EnvSpec("own", 4, 2, slice(0, 2), 10, None, False), "cpu")["git_commit"]
+        return protocol.of(EnvSpec("own", 4, 2, slice(0, 2), 10, None, False), "cpu")["git_commit"]
 
-    source = tmp_path / "src" / "senior" / "rundir.py"
-    monkeypatch.setattr(rundir, "__file__", str(source))
+    source = tmp_path / "src" / "senior" / "protocol.py"
+    monkeypatch.setattr(protocol, "__file__", str(source))
     source.parent.mkdir(parents=True)
     source.write_text("first")
     assert told() is None

@@ -287,6 +287,39 @@ class FailsAtOnce(Lift):
         raise OSError("cable")
 
 
+class NoObservations(gymnasium.Env):
+    action_space = Lift.action_space
+
+
+class NoActions(gymnasium.Env):
+    observation_space = Lift.observation_space
+
+
+class Returns(Lift):
+    """Its reward is an array of one, as a batch of one has it; its `close` raises."""
+
+    reward: Any = np.ones(1)
+    told: Any = np.array([True])
+
+    def step(self, action: np.ndarray):
+        return np.concatenate([action, action]), self.reward, False, False, self.told and {"success": self.told}
+
+    def close(self):
+        raise RuntimeError("no viewer")
+
+
+class TwoRewards(Returns):
+    reward = np.ones(2)
+
+
+class NoInfo(Returns):
+    told = None
+
+
+class TooMuch(Returns):
+    reward = 1e39  # more than float32 holds
+
+
 def limited() -> gymnasium.Env:
     return TimeLimit(Lift(), 33)
 
@@ -308,6 +341,14 @@ def test_a_custom_environment():
         assert info["success"] is True
         low, high = Lift.action_space.low, Lift.action_space.high
         np.testing.assert_allclose(observation[:3], low + share * (high - low), rtol=1e-6)
+
+
+def test_an_array_of_one_is_a_number():
+    place = Local(lambda: envs.make(None, f"{HERE}:Returns", "0:3", horizon=20), 0, TRAINING)
+    assert place.begin(0) is None
+    step = taken(go(place, np.zeros(3, np.float32)))
+    assert (step.reward, step.success) == (1.0, 1.0)
+    place.close()
 
 
 def test_no_environment_ends_the_program(monkeypatch: pytest.MonkeyPatch):
@@ -355,6 +396,11 @@ def test_a_users_file_in_the_current_directory(tmp_path, monkeypatch):
         (f"{HERE}:Broken", "cannot be built: OSError: no robot attached"),
         (f"{HERE}:Exits", "cannot be built: ProgramEnded: no licence"),
         (f"{HERE}:FailsAtOnce", "fails at its first step: OSError: cable"),
+        (f"{HERE}:NoObservations", "has no observation_space: AttributeError"),
+        (f"{HERE}:NoActions", "has no action_space: AttributeError"),
+        (f"{HERE}:TwoRewards", r"at its first step: the reward is an array of shape \(2,\)\.$"),
+        (f"{HERE}:NoInfo", r"at its first step: the info of a step is None, not a dict\.$"),
+        (f"{HERE}:TooMuch", r"at its first step: the reward is 1e\+39\.$"),
         ("Pendulum-v11", "did you mean Pendulum-v1"),
     ],
 )

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
 
 from senior.config import Config
 from senior.envs.episodes import AFTERWARDS, EVALUATION, TRAINING, episode_seed
@@ -15,7 +18,7 @@ from senior.envs.point import Point
 from senior.files import unpack
 from senior.judgement import evaluate_run
 from senior.program import Quiet, Result, resume, train
-from senior.rundir import saved_steps
+from senior.rundir import RunDirectory, saved_steps
 from senior.types import BadInput
 from tests.equal import assert_same_run, progress_of
 from tests.small import rows, small
@@ -193,6 +196,43 @@ def test_an_environment_that_cannot_begin_leaves_nothing_behind(tmp_path: Path, 
     with pytest.raises(BadInput, match="of seed 1 failed in episode 0 after step 0: RuntimeError: brake stuck"):
         train(config(), tmp_path / "out", seeds=2)
     assert not (tmp_path / "out").exists()
+
+
+def test_networks_that_diverge_stop_their_run_before_they_are_saved(tmp_path: Path):
+    wild = config()
+    wild = replace(wild, sac=replace(wild.sac, critic_rate=1e30, actor_rate=1e30))
+    said = Said()
+    (result,) = train(wild, tmp_path, watcher=said)
+    assert result.failure is not None and "networks have diverged" in result.failure
+    assert any("networks have diverged" in sentence for sentence in said.sentences)
+    for step in saved_steps(result.path / "checkpoints"):
+        held = unpack(result.path / "checkpoints" / f"step-{step:010d}.npz")
+        assert all(np.isfinite(array).all() for array in held.values() if array.dtype == np.float32)
+
+
+def test_a_disk_that_is_full_for_tensorboard_keeps_no_row_from_its_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def full(*_: object) -> None:
+        raise OSError("No space left on device")
+
+    directory = RunDirectory(tmp_path / "run")
+    directory.create(config(), {})
+    directory.forget_everything()
+    for step in range(3):
+        directory.append("eval.csv", {"step": step, "success_rate": None, "return_mean": 1.5, "return_std": 2.0})
+        monkeypatch.setattr(EventsWriter, "write_event", full)
+    directory.close()
+    assert len(rows(directory.path / "eval.csv")) == 3
+
+    (file,) = (directory.path / "tensorboard").iterdir()
+    written, found = file.read_bytes(), []
+    while written:  # length, checksum, event, checksum
+        (length,) = struct.unpack("<Q", written[:8])
+        event = Event.FromString(written[12 : 12 + length])
+        found += [(event.step, value.tag, value.simple_value) for value in event.summary.value]
+        written = written[16 + length :]
+    assert found == [(0, "eval/return_mean", 1.5), (0, "eval/return_std", 2.0)]
 
 
 def test_all_runs_stop_when_all_break(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

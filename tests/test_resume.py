@@ -20,7 +20,8 @@ from senior.cli.display import Display
 from senior.cli.shared import DONE, INTERRUPTED
 from senior.config import Answering, Config, load
 from senior.envs.point import Point
-from senior.judgement import load_policy
+from senior.judgement import evaluate_run
+from senior.policy import load_policy
 from senior.presets import release
 from senior.program import Quiet, resume, train
 from senior.rundir import saved_steps
@@ -225,10 +226,12 @@ def test_a_finished_run_is_left_as_it_is(reference: Path, tmp_path: Path):
     run = tmp_path / "seed-0"
     shutil.copytree(reference / "seed-0", run)
     for _ in range(2):
+        before = sorted((path, path.stat().st_mtime_ns) for path in run.rglob("*"))
         (result,) = resume(run)
         assert (result.finished, result.step, result.labels) == (True, 1000, 25)
+        assert before == sorted((path, path.stat().st_mtime_ns) for path in run.rglob("*"))
         assert_same_run(run, reference / "seed-0", interrupted=False)
-        assert load_policy(run)[0] == 1000
+        assert load_policy(run).step == 1000
 
 
 def test_with_its_newest_checkpoint_damaged_a_run_goes_on_from_the_one_before(reference: Path, tmp_path: Path):
@@ -309,10 +312,38 @@ def test_with_all_checkpoints_damaged_there_is_one_clear_sentence(
         resume(tmp_path / "elsewhere", Stop())
 
 
+def test_a_run_whose_checkpoints_are_gone_keeps_its_results(reference: Path, tmp_path: Path):
+    run = tmp_path / "seed-0"
+    shutil.copytree(reference / "seed-0", run)
+    shutil.rmtree(run / "checkpoints")
+    for name in (None, "status.json", "policy"):  # as somebody may have copied it
+        if name:
+            shutil.rmtree(run / name) if (run / name).is_dir() else (run / name).unlink()
+        before = {path: path.read_bytes() for path in sorted(run.rglob("*.csv"))}
+        with pytest.raises(BadInput, match=r"The checkpoints of the run in .*seed-0 are gone, so it cannot go on"):
+            resume(run, Stop())
+        assert before == {path: path.read_bytes() for path in sorted(run.rglob("*.csv"))}
+
+
+def test_a_run_whose_environment_has_changed_does_not_go_on(reference: Path, tmp_path: Path):
+    run = tmp_path / "seed-0"
+    shutil.copytree(reference / "seed-0", run)
+    (run / "checkpoints" / "step-0000001000.npz").unlink()
+    content = json.loads((run / "config.json").read_text())
+    content["protocol"]["observation_size"] = 3
+    (run / "config.json").write_text(json.dumps(content))
+    sentence = r"The environment point has changed since the run in .* began: its observation size was 3 and is 4\."
+    with pytest.raises(BadInput, match=sentence):
+        resume(run, Stop())
+    with pytest.raises(BadInput, match=sentence):
+        evaluate_run(run, episodes=1)
+
+
 def test_a_run_of_another_machine_goes_on_but_says_so(reference: Path, tmp_path: Path):
     run = tmp_path / "seed-0"
     shutil.copytree(reference / "seed-0", run)
     content = json.loads((run / "config.json").read_text())
+    (run / "checkpoints" / "step-0000001000.npz").unlink()
     content["protocol"]["threads"] += 1
     content["protocol"]["packages"]["jax"] = "0.0.1"
     (run / "config.json").write_text(json.dumps(content))

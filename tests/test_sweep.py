@@ -23,7 +23,8 @@ from rich.console import Console
 from senior.cli import main
 from senior.cli.shared import DONE, INTERRUPTED
 from senior.envs.point import Point
-from senior.rundir import HELD, RunDirectory, threads
+from senior.protocol import threads
+from senior.rundir import HELD, RunDirectory
 from senior.sweep.board import Board
 from senior.sweep.cells import Cell, Done, Job, Outcome, check_cells, is_finished, job_of, order, outcomes_of, report
 from senior.sweep.grid import cells_of, merged, read, split

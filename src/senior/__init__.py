@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from senior.judgement import Judgement, evaluate_run
     from senior.loop import Watcher
     from senior.methods import METHODS, Method
+    from senior.policy import Policy, load_policy
     from senior.presets import preset, release, with_budget
     from senior.program import Quiet, resume, train, train_all
     from senior.schedule import plan
@@ -34,12 +35,14 @@ _HOME = {
     "Judgement": "judgement",
     "Method": "methods",
     "Pairs": "types",
+    "Policy": "policy",
     "Query": "types",
     "Quiet": "program",
     "Result": "together",
     "Selection": "select",
     "Watcher": "loop",
     "evaluate_run": "judgement",
+    "load_policy": "policy",
     "plan": "schedule",
     "preset": "presets",
     "release": "presets",
@@ -59,12 +62,14 @@ __all__ = [
     "Judgement",
     "Method",
     "Pairs",
+    "Policy",
     "Query",
     "Quiet",
     "Result",
     "Selection",
     "Watcher",
     "evaluate_run",
+    "load_policy",
     "plan",
     "preset",
     "release",

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from senior import program, rundir, session
+from senior import program, protocol, rundir, session
 from senior.checks import check
 from senior.config import Config, Pretraining
 from senior.fit import spec_of
@@ -260,7 +260,7 @@ def run_environments(task: str, count: int, json_file: Path | None) -> None:
 
 
 def _machine(spec: EnvSpec, device: str) -> dict[str, Any]:
-    return {key: rundir.protocol(spec, device)[key] for key in ("device", "threads", "machine", "packages")}
+    return {key: protocol.of(spec, device)[key] for key in ("device", "threads", "machine", "packages")}
 
 
 def _keep(json_file: Path | None, found: dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from senior import envs, rundir
+from senior import envs, protocol
 from senior.envs import metaworld
 from senior.envs.episodes import TRAINING, Episodes, Failure, Local
 from senior.envs.workers import Remote, Workers
@@ -88,7 +88,7 @@ def run(task: str, count: int) -> dict[str, Any]:
     """`senior bench --environments N`: print the figures of one task."""
     if task not in metaworld.TASKS:
         raise BadInput.unknown("task", task, metaworld.TASKS)
-    figures = measure(task, count, min(rundir.threads(), count))
+    figures = measure(task, count, min(protocol.threads(), count))
     rates = figures["steps_per_second"]
     print(f"{count} environments of {task}, random actions, whole episodes with their resets; steps per second:")
     for name, told in (

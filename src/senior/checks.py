@@ -58,6 +58,7 @@ def check(config: Config) -> Config:
         *((f"--{name}", getattr(config.answering, name) or 0.0) for name in ("skip", "equal")),
     ):
         _require(0 <= value < float("inf"), f"{name} must be 0 or more, not {value}.")
+    _require(config.steps < 2**31, f"--steps must be below {2**31}, not {config.steps}.")
     _require(config.seed < 2**32, f"--seed must be below {2**32}, not {config.seed}.")
     for name, episodes in (("--candidate-episodes", queries.episodes), ("--qpa.episodes", config.qpa.episodes)):
         _require(episodes >= 2, f"{name} must be at least 2, as pairs need, not {episodes}.")

@@ -14,8 +14,8 @@ from senior.agent.networks import MLP
 from senior.config import load
 from senior.envs import render
 from senior.envs.episodes import AFTERWARDS, Failure, Local, episode_seed
-from senior.files import Damaged, unpack
 from senior.learner import mean_action
+from senior.policy import load_policy
 from senior.runs import prepare_device
 from senior.trainee import made_by, make_environment
 from senior.types import BadInput
@@ -48,12 +48,14 @@ def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None 
     path = Path(path)
     config = load(path / "config.json")
     prepare_device("auto")
-    step, actor = load_policy(path)
-    policy = jax.jit(mean_action)
+    policy = load_policy(path)
+    actor = MLP(tuple(map(jnp.asarray, policy.weights)), tuple(map(jnp.asarray, policy.biases)))
+    act = jax.jit(mean_action)
     place = Local(lambda: make_environment(config), config.seed, AFTERWARDS)
     try:
+        rundir.RunDirectory(path).check_fits(place.spec)
         episodes_of = {0: range(episodes)}
-        judged = evaluate.judge(lambda seen: {0: np.asarray(policy(actor, seen[0]))}, {0: [place]}, episodes_of)[0]
+        judged = evaluate.judge(lambda seen: {0: np.asarray(act(actor, seen[0]))}, {0: [place]}, episodes_of)[0]
     finally:
         place.close()
     if isinstance(judged, Failure):
@@ -69,7 +71,7 @@ def evaluate_run(path: Path | str, episodes: int = 10, video: Path | str | None 
         summary["success_rate"],
         float(summary["return_mean"] or 0),
         float(summary["return_std"] or 0),
-        step,
+        policy.step,
         None if video is None or reason else Path(video),
         reason,
     )
@@ -101,20 +103,3 @@ def film_policy(path: Path, out: Path) -> str | None:
         return evaluate_run(path, episodes=1, video=out).no_video
     except BadInput as error:
         return str(error)
-
-
-def load_policy(path: Path) -> tuple[int, MLP]:
-    """The step and the actor of a run's saved policy."""
-    file = path / "policy" / "actor.npz"
-    if not file.exists():
-        raise BadInput(f"{path} holds no policy yet: the run has not reached its first checkpoint.")
-    try:
-        saved = unpack(file)
-        layers = sum(name.startswith("weight_") for name in saved)
-        actor = MLP(
-            tuple(jnp.asarray(saved[f"weight_{i}"]) for i in range(layers)),
-            tuple(jnp.asarray(saved[f"bias_{i}"]) for i in range(layers)),
-        )
-        return int(saved["step"]), actor
-    except (Damaged, KeyError) as error:
-        raise BadInput(f"The policy of {path} cannot be read: {error}.") from error

@@ -16,13 +16,14 @@ from typing import Any
 
 import numpy as np
 
+from senior import protocol
 from senior.config import load
 from senior.label import agreement
 from senior.label.desk import Desk
 from senior.label_file import SEGMENTS, Labels, read, shapes, write
 from senior.preference_file import ANSWER, PAIR, asked_of, connect, pairs_of
 from senior.preferences import Preferences
-from senior.rundir import RunDirectory, read_protocol, told
+from senior.rundir import RunDirectory, told
 from senior.types import BadInput, Preferred
 
 # From a run into files.
@@ -163,8 +164,8 @@ def import_into(run: Path, file: Path) -> int:
             f"human) only; to train on nothing else, begin a run with --teacher {file}."
         )
     try:
-        protocol = read_protocol(run)
-        sizes = config.queries.segment, protocol["observation_size"], protocol["action_size"]
+        held = protocol.read(run)
+        sizes = config.queries.segment, held["observation_size"], held["action_size"]
     except (KeyError, TypeError) as error:
         raise BadInput(f"{run / 'config.json'} is damaged: its protocol tells no sizes.") from error
     directory = RunDirectory(run)

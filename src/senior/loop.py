@@ -306,7 +306,8 @@ class Training:
                 progress.snapped = step
             if step > progress.step and (step % config.checkpoint_every == 0 or at_end or last):
                 with self.clock.part("checkpoint"):
-                    trainee.save(self.runs[i], step)
+                    if not trainee.save(self.runs[i], step):
+                        self.watcher.say(f"{trainee.name} is stopped at step {step}: {trainee.failure}")
             trainee.done = at_end
 
     def evaluate(self, judged: Sequence[int], step: int) -> None:
@@ -383,8 +384,8 @@ class Training:
         trainee.failure = message
         if step > trainee.progress.step:
             trainee.save(self.runs[i], step)
-        kept = ", with a checkpoint" if step else ""
-        self.watcher.say(f"{trainee.name} is stopped at step {step}{kept}: {message}")
+        kept = ", with a checkpoint" if step and trainee.progress.step == step else ""
+        self.watcher.say(f"{trainee.name} is stopped at step {step}{kept}: {trainee.failure}")
 
 
 def _fact(trainee: Trainee, happened: Step | None) -> Fact:

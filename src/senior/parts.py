@@ -26,7 +26,7 @@ def load(name: str, known: dict[str, str], kind: str) -> Any:
         sys.path.append(os.getcwd())
     try:
         holder = importlib.import_module(module)
-    except Exception as error:  # whatever the user's module raises
+    except (Exception, SystemExit) as error:  # whatever the user's module raises
         raise BadInput(f"The {kind} {name!r} cannot be imported: {' '.join(str(error).split())}.") from error
     found = getattr(holder, attribute, None)
     if found is None:

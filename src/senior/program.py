@@ -8,9 +8,10 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 
-from senior import parts, rundir
+from senior import checkpoint, parts, protocol, rundir
 from senior.config import Config, load
 from senior.envs.drawing import NoVideo, prepare_opengl
+from senior.files import json_object
 from senior.fit import check_fit, check_offered, spec_of
 from senior.label.address import Address
 from senior.label.serving import check_installed
@@ -100,7 +101,7 @@ def train_all(
                 if not trainee.filmed:
                     trainee.reset(0)
             for trainee in trainees:
-                trainee.directory.create(trainee.config, rundir.protocol(trainee.spec, device))
+                trainee.directory.create(trainee.config, protocol.of(trainee.spec, device))
                 if trainee.filmed:  # into that directory
                     trainee.reset(0)
         except BaseException:
@@ -139,7 +140,7 @@ def _opened(trainee: Trainee, device: str, watcher: Watcher) -> Waiting:
         return _reopened(trainee, device, watcher)
     directory.check_free()
     trainee.reset(0)
-    directory.create(trainee.config, rundir.protocol(trainee.spec, device))
+    directory.create(trainee.config, protocol.of(trainee.spec, device))
     return Waiting(trainee, trainee.begin)
 
 
@@ -147,6 +148,7 @@ def _reopened(trainee: Trainee, device: str, watcher: Watcher) -> Waiting:
     """A run that is there; `BadInput` if another process trains it."""
     with rundir.told(trainee.directory.path):
         trainee.directory.lock()
+    trainee.directory.check_fits(trainee.spec)
     _compare_protocol(trainee, device, watcher)
     return Waiting(trainee, partial(trainee.resume, watcher.say))
 
@@ -222,6 +224,10 @@ def resume(
             trainee = None
             try:
                 config = load(directory / "config.json")
+                finished = _finished(directory, config) if over[directory] else None
+                if finished is not None:
+                    results.append(finished)
+                    continue
                 _ready_for_people([config])
                 if pools is None:
                     device, wanted = prepare_device(config.device), config.device
@@ -242,6 +248,15 @@ def resume(
                 results.append(unopened(directory, error, watcher))
         results += train_waiting(waiting, watcher, None, runs_per_device, len(found) == 1, page)
     return sorted(results, key=lambda result: found.index(result.path))
+
+
+def _finished(run: Path, config: Config) -> Result | None:
+    """What came of a run that has told that it is finished, without opening it; None if something is left to do."""
+    stood = checkpoint.standing(run / "checkpoints")
+    told = json_object(run / "status.json").get("phase") == "finished" and (run / "plots").is_dir()
+    if stood is None or stood["step"] < config.steps or not told:
+        return None
+    return Result(run, config.seed, stood["step"], True, None, stood["labels"], stood["success"])
 
 
 def _is_over(run: Path) -> bool:
@@ -268,8 +283,8 @@ def _learner(config: Config, spec: EnvSpec) -> Learner:
 
 def _compare_protocol(trainee: Trainee, device: str, watcher: Watcher) -> None:
     """Say so if the bits may differ from those of the uninterrupted run."""
-    then = rundir.read_protocol(trainee.directory.path)
-    now = rundir.protocol(trainee.spec, device)
+    then = protocol.read(trainee.directory.path)
+    now = protocol.of(trainee.spec, device)
     changed = [name for name in ("device", "threads", "packages") if then.get(name) != now[name]]
     if changed:
         watcher.say(

@@ -11,24 +11,21 @@ import csv
 import io
 import json
 import os
-import platform
 import re
 import shutil
-import subprocess
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tensorboardX import SummaryWriter
 
+from senior import protocol
+from senior.board import Board
 from senior.config import Config, differences, load, to_json
-from senior.envs import metaworld
-from senior.files import Damaged, hold, pack, unpack, write_atomically
+from senior.files import Damaged, hold, json_object, pack, unpack, write_atomically
 from senior.types import BadInput, EnvSpec
 
 EVAL = ("step", "labels", "queried", "episodes", "success_rate", "return_mean", "return_std")
@@ -75,7 +72,6 @@ TABLES = {"eval.csv": EVAL, "train.csv": TRAIN, "timing.csv": TIMING}
 _CHECKPOINT = re.compile(r"step-(\d{10})\.npz")
 HELD = "is being trained by another process"
 """Said of a run whose lock another process holds."""
-PACKAGES = ("senior-rl", "jax", "jaxlib", "optax", "numpy", "gymnasium", "metaworld", "mujoco")
 
 
 class RunDirectory:
@@ -84,7 +80,7 @@ class RunDirectory:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.checkpoints = path / "checkpoints"
-        self._board: SummaryWriter | None = None
+        self._board: Board | None = None
         self._lock: int | None = None
 
     @property
@@ -134,6 +130,27 @@ class RunDirectory:
             others = f"; {', '.join(other for other, *_ in differing[1:])} differ too" if differing[1:] else ""
             raise BadInput(f"{self.path} holds another run: its {name} is {there}, not {here}{others}.")
 
+    def check_beginning(self, first: int) -> None:
+        """`BadInput` if the run was beyond its ``first`` checkpoint: it was not killed before it, but lost it."""
+        at = 0
+        with suppress(OSError, KeyError, ValueError), open(self.path / "eval.csv", newline="") as file:
+            at = max([int(row["step"]) for row in csv.DictReader(file)], default=0)
+        if at > first or json_object(self.path / "status.json").get("phase") == "finished":
+            raise BadInput(
+                f"The checkpoints of the run in {self.path} are gone, so it cannot go on. Its results are kept; to "
+                "train it anew, name another directory."
+            )
+
+    def check_fits(self, spec: EnvSpec) -> None:
+        """`BadInput` if the environment is no longer what the run began with."""
+        now = json.loads(json.dumps(protocol.of_environment(spec)))
+        for name, held in protocol.read(self.path).items():
+            if name in now and now[name] != held:
+                raise BadInput(
+                    f"The environment {spec.name} has changed since the run in {self.path} began: its "
+                    f"{name.replace('_', ' ')} was {held} and is {now[name]}."
+                )
+
     def append(self, table: str, row: Mapping[str, Any]) -> None:
         """One row; numbers that are missing or None stay empty."""
         columns = TABLES[table]
@@ -143,10 +160,10 @@ class RunDirectory:
         csv.writer(line, lineterminator="\n").writerow([_text(row.get(name)) for name in columns])
         with open(self.path / table, "a") as file:
             file.write(line.getvalue())
-        board, step = self._tensorboard(), int(row["step"])
-        for name, value in row.items():
-            if value is not None and name != "step":
-                board.add_scalar(f"{table.removesuffix('.csv')}/{name}", float(value), step)
+        if self._board is None:
+            self._board = Board(self.path / "tensorboard")
+        kind = table.removesuffix(".csv")
+        self._board.add({f"{kind}/{name}": value for name, value in row.items() if name != "step"}, int(row["step"]))
 
     def warn(self, sentence: str) -> None:
         """Keep a health warning."""
@@ -161,8 +178,9 @@ class RunDirectory:
     def tell(self, status: Mapping[str, Any]) -> None:
         """What the run is doing now, for whoever looks on. It need not outlive a crash of the machine."""
         new = self.path / "status.json.tmp"
-        new.write_text(json.dumps(status))
-        os.replace(new, self.path / "status.json")
+        with suppress(OSError):  # what matters is told elsewhere
+            new.write_text(json.dumps(status))
+            os.replace(new, self.path / "status.json")
 
     def lengths(self) -> dict[str, int]:
         """Bytes in every append-only file, which are then on the disk."""
@@ -177,6 +195,10 @@ class RunDirectory:
         """Cut the append-only files back to a checkpoint's lengths and forget snapshots after its step."""
         for name, columns in TABLES.items():
             if name in lengths:
+                if (self.path / name).stat().st_size < lengths[name]:
+                    raise BadInput(
+                        f"{self.path / name} is shorter than it was at step {step}; it cannot be gone on with."
+                    )
                 os.truncate(self.path / name, lengths[name])
             else:
                 (self.path / name).write_text(",".join(columns) + "\n")
@@ -185,7 +207,7 @@ class RunDirectory:
         for path in (self.path / "bonus").glob("step-*.npz"):
             if int(path.stem.removeprefix("step-")) > step:
                 path.unlink()
-        self._board = SummaryWriter(str(self.path / "tensorboard"), purge_step=step + 1)
+        self._board = Board(self.path / "tensorboard", purge=step + 1)
 
     def snapshot(self, step: int, positions: np.ndarray, bonus: Mapping[str, np.ndarray]) -> None:
         """Add visited positions ``[n, d]`` to ``positions.npz``; what is behind f_P and f_E goes to ``bonus/``."""
@@ -220,11 +242,6 @@ class RunDirectory:
             os.close(self._lock)
             self._lock = None
 
-    def _tensorboard(self) -> SummaryWriter:
-        if self._board is None:
-            self._board = SummaryWriter(str(self.path / "tensorboard"))
-        return self._board
-
 
 @contextmanager
 def told(path: Path) -> Iterator[None]:
@@ -239,9 +256,9 @@ def told(path: Path) -> Iterator[None]:
 
 def make_room(file: Path) -> None:
     """Make the folder of a file that will be written when work is done; `BadInput` now if that cannot be."""
-    if file.is_dir():
-        raise BadInput(f"{file} is a directory; name a file.")
     with told(file.parent):
+        if file.is_dir():
+            raise BadInput(f"{file} is a directory; name a file.")
         file.parent.mkdir(parents=True, exist_ok=True)
 
 
@@ -280,67 +297,6 @@ def saved_steps(checkpoints: Path) -> list[int]:
     """Steps at which there are checkpoints in that folder of a run, newest first."""
     found = (_CHECKPOINT.fullmatch(path.name) for path in checkpoints.glob("step-*.npz"))
     return sorted((int(match[1]) for match in found if match), reverse=True)
-
-
-def read_protocol(path: Path) -> dict[str, Any]:
-    """The protocol in a run's ``config.json``."""
-    return json.loads((path / "config.json").read_text()).get("protocol", {})
-
-
-def protocol(spec: EnvSpec, device: str) -> dict[str, Any]:
-    """What a number of this run depends on beside its configuration."""
-    return {
-        "environment": spec.name,
-        "reward_version": metaworld.REWARD_FUNCTION_VERSION if spec.name in metaworld.TASKS else None,
-        "horizon": spec.horizon,
-        "observation_size": spec.observation_size,
-        "action_size": spec.action_size,
-        "position": [spec.position.start, spec.position.stop],
-        "device": device,
-        "threads": threads(),
-        "machine": f"{platform.system()} {platform.machine()}, {_processor()}",
-        "python": platform.python_version(),
-        "packages": {name: _version(name) for name in PACKAGES},
-        "git_commit": _commit(),
-    }
-
-
-def threads() -> int:
-    """Processors this process may use; XLA's thread pool has as many."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or "unknown processor"
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
-
-
-def _commit() -> str | None:
-    """The commit of the source tree this package runs from, if it is one; "-changed" where its files differ from it
-    or one is not in it."""
-    source = Path(__file__).resolve().parent
-    if source.parent.name != "src":
-        return None
-    try:
-        changed = _git(source, "--no-optional-locks", "status", "--porcelain", "--", ".")
-        return _git(source, "rev-parse", "HEAD") + ("-changed" if changed else "")
-    except (OSError, subprocess.SubprocessError):
-        return None
-
-
-def _git(place: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(place), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
 
 
 def _text(value: Any) -> str:

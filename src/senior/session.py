@@ -32,8 +32,9 @@ def hold(
     pause: waits a moment, told whether it is the first; False: the run is to be left as it was saved before it asked.
     Returns None, or in a sentence why the run cannot go on.
     """
-    if parts.takes_time(trainee.config) and step > trainee.progress.step:
-        trainee.save(runs[i], step)  # whatever befalls it while it waits
+    before = parts.takes_time(trainee.config) and step > trainee.progress.step  # whatever befalls it while it waits
+    if before and not trainee.save(runs[i], step):
+        return trainee.failure
     if not ask(trainee, runs, i, step, n, warn):
         return None
     refused, first = listen(trainee), True

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from senior import checkpoint, rundir
+from senior import checkpoint, protocol
 from senior.config import Config
 from senior.envs.workers import Worker, Workers
 from senior.label.address import Address, check_address
@@ -69,7 +69,7 @@ class Pools:
 
 def count_workers(device: str) -> int:
     """How many workers suit a program: on a CPU none, because the updates keep all processors busy."""
-    return rundir.threads() if device == "gpu" else 0
+    return protocol.threads() if device == "gpu" else 0
 
 
 class Waiting(NamedTuple):
@@ -189,7 +189,7 @@ def _together(
     # under vmap states are there twice while they are put into one array
     room = np.cumsum(sizes) * (2 if lift == "vmap" else 1) <= 0.9 * device_memory(device)
     count = max(1, min(int(room.sum()), runs_per_device or len(trainees)))
-    told = f"Training on the {device.upper()}, {rundir.threads()} threads. A run keeps {max(sizes) / 1e6:,.1f} MB"
+    told = f"Training on the {device.upper()}, {protocol.threads()} threads. A run keeps {max(sizes) / 1e6:,.1f} MB"
     if len(trainees) > 1:
         told += f"; {count} of {len(trainees)} runs at a time, {sum(sizes[:count]) / 1e6:,.1f} MB"
     watcher.say(f"{told}.")

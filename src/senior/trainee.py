@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from senior import checkpoint, envs, labels, parts
@@ -175,6 +176,7 @@ class Trainee:
         if found is None:
             if any(self.directory.checkpoints.glob("step-*.npz")):
                 raise BadInput(f"No checkpoint in {self.directory.path} can be read; the run cannot be resumed.")
+            self.directory.check_beginning(self.config.checkpoint_every)
             if isinstance(self.environment, Recording):
                 self.environment.forget(0)
             self.reset(0)
@@ -226,17 +228,25 @@ class Trainee:
             self.reset(progress.episode)
         return run
 
-    def save(self, run: Run, step: int) -> None:
-        """Write the policy and a checkpoint at the beginning of ``step``.
+    def save(self, run: Run, step: int) -> bool:
+        """Write the policy and a checkpoint at the beginning of ``step``; False: not of networks that have diverged,
+        which is a failure.
 
         The policy first: a run that is killed between the two then writes it again, where the other way round one
         killed after its last checkpoint would keep an older policy for ever.
         """
-        self.directory.save_policy({**policy_arrays(run), "step": np.asarray(step)})
         progress = self.progress
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((run.agent, run.model))):
+            self.failure = (
+                f"Its networks have diverged: by step {step} they hold numbers that are not finite. What was saved at "
+                f"step {progress.step} is kept; lower the rates of --sac or --reward."
+            )
+            return False
+        self.directory.save_policy({**policy_arrays(run), "step": np.asarray(step)})
         progress.step = step
         progress.lengths = self.directory.lengths()
         progress.written = checkpoint.save(self.directory.checkpoints, step, run, asdict(progress), progress.written)
+        return True
 
     def tell(self, phase: str, step: int) -> None:
         """Tell whoever looks on from outside what the run is doing; twice a second at most.

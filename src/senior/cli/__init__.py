@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import sys
 from collections.abc import Callable, Sequence
 
@@ -45,6 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"senior: {error}", file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:
+        return FAILED
+    except (OSError, sqlite3.Error) as error:  # a full disk, say
+        print(f"senior: {' '.join(str(error).split())}. What was saved is kept.", file=sys.stderr)
         return FAILED
     except KeyboardInterrupt:
         return INTERRUPTED

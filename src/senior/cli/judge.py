@@ -43,8 +43,8 @@ class BenchOptions:
     environments: int | None = None
     """Only step so many environments of the task, without learning: stock, here, and in worker processes.
     Of the other options --task and --json are used then."""
-    device: str = "auto"
-    """auto, cpu or gpu."""
+    device: Literal["auto", "cpu", "gpu"] = "auto"
+    """Where to compute."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Number format of the networks' products."""
     json: Path | None = None

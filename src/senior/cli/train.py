@@ -89,7 +89,7 @@ def _report(results: Sequence[Any], display: Display) -> int:
             print(f"  success rate   {success} in the last evaluation; labels used: {result.labels}")
             print(f"  learning curve {result.path / 'plots' / 'learning-curve.png'}")
             video = result.path / "videos" / "final.mp4"
-            reason = judgement.film_policy(result.path, video)
+            reason = None if video.exists() else judgement.film_policy(result.path, video)
             print(f"  video          {reason or video}")
     if any(result.failure for result in results):
         return FAILED

@@ -8,6 +8,7 @@ environment, bit for bit, which is how runs are resumed, dead workers replaced a
 from __future__ import annotations
 
 import contextlib
+import sysconfig
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,6 +24,9 @@ TRAINING = 0
 EVALUATION = 1
 AFTERWARDS = 2
 """Purposes of episodes: training, evaluation within it and `senior eval` never share one."""
+
+LARGEST = float(np.finfo(np.float32).max)
+OURS, PYTHONS = Path(__file__).parents[1], Path(sysconfig.get_path("stdlib"))
 
 
 class Step(NamedTuple):
@@ -148,9 +152,9 @@ class Local:
         try:
             # a copy, because an environment may scale what it is given in place
             raw, reward, terminated, truncated, info = self.env.step(action.copy())
-            observation = _checked(raw, spec)
-            reward = _finite("reward", reward)
-            success = _finite("success", info.get("success", 0.0)) if spec.tells_success else None
+            observation = checked(raw, spec.observation_size)
+            reward = finite("reward", reward)
+            success = finite("success", info.get("success", 0.0)) if spec.tells_success else None
         except Exception as error:
             return self._fail(error)
         self.elapsed += 1
@@ -172,13 +176,13 @@ class Local:
         self.elapsed = 0
         try:
             raw, _ = self.env.reset(seed=episode_seed(self.seed, self.purpose, self.episode))
-            self.observation = _checked(raw, self.spec)
+            self.observation = checked(raw, self.spec.observation_size)
         except Exception as error:
             return self._fail(error)
         return None
 
     def _fail(self, error: Exception) -> Failure:
-        cause = str(error) if isinstance(error, _BadNumber) else f"{type(error).__name__}: {error}{_raised_at(error)}"
+        cause = str(error) if isinstance(error, BadNumber) else f"{type(error).__name__}: {error}{_raised_at(error)}"
         self.failure = Failure(
             f"The environment {self.spec.name} of seed {self.seed} failed in episode "
             f"{self.episode} after step {self.elapsed}: {' '.join(cause.split())}"
@@ -187,35 +191,39 @@ class Local:
 
 
 def _raised_at(error: BaseException) -> str:
-    """Where outside of this package an error came from, for whoever wrote the environment; empty if inside of it."""
-    ours = Path(__file__).parents[1]
+    """Where an error came from: the last line that is neither of this package, nor of Python, nor of one installed."""
     for raised in filter(None, (error, error.__cause__)):
-        frames = [
-            frame for frame in traceback.extract_tb(raised.__traceback__) if ours not in Path(frame.filename).parents
-        ]
-        if frames:
-            return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})"
+        for frame in reversed(traceback.extract_tb(raised.__traceback__)):
+            file = Path(frame.filename)
+            if not {OURS, PYTHONS} & {*file.parents} and "site-packages" not in file.parts:
+                return f" ({file.name}, line {frame.lineno})"
     return ""
 
 
-class _BadNumber(Exception):
+class BadNumber(Exception):
     """The environment gave a number or a shape that no learner can use."""
 
 
-def _checked(observation: Any, spec: EnvSpec) -> np.ndarray:
-    """A float32 copy of an observation, checked: [o] and finite."""
+def checked(observation: Any, size: int) -> np.ndarray:
+    """A float32 copy of an observation, checked: [size] and finite. Raises `BadNumber`."""
     with np.errstate(over="ignore"):  # beyond float32 becomes infinite, and is told below
         copy = np.array(observation, np.float32)
-    if copy.shape != (spec.observation_size,):
-        raise _BadNumber(f"the observation has shape {copy.shape} instead of ({spec.observation_size},).")
+    if copy.shape != (size,):
+        raise BadNumber(f"the observation has shape {copy.shape} instead of ({size},).")
     if not np.isfinite(copy).all():
         where = int(np.flatnonzero(~np.isfinite(copy))[0])
-        raise _BadNumber(f"the observation is {copy[where]} at index {where}.")
+        raise BadNumber(f"the observation is {copy[where]} at index {where}.")
     return copy
 
 
-def _finite(what: str, value: Any) -> float:
-    number = float(value)
-    if not np.isfinite(number):
-        raise _BadNumber(f"the {what} is {number}.")
+def finite(what: str, value: Any) -> float:
+    """A number that float32 can hold, or the one in an array of one. Raises `BadNumber`."""
+    if np.size(value) != 1:
+        raise BadNumber(f"the {what} is an array of shape {np.shape(value)}.")
+    try:
+        number = float(np.asarray(value).item())
+    except (TypeError, ValueError):
+        raise BadNumber(f"the {what} is {value!r}.") from None
+    if not abs(number) <= LARGEST:
+        raise BadNumber(f"the {what} is {number}.")
     return number

@@ -19,6 +19,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import RescaleAction, TimeLimit, TransformAction
 
+from senior.envs.episodes import BadNumber, checked, finite
 from senior.types import BadInput, EnvSpec
 
 
@@ -35,7 +36,7 @@ def _staying() -> Iterator[None]:
 
 
 class Staying(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Raises `ProgramEnded` where the environment would end the program."""
+    """Raises `ProgramEnded` where the environment would end the program. What its `close` raises is heard by nobody."""
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         with _staying():
@@ -50,7 +51,7 @@ class Staying(gymnasium.Wrapper[Any, Any, Any, Any]):
             return self.env.render()
 
     def close(self) -> None:
-        with suppress(SystemExit):
+        with suppress(Exception, SystemExit):
             self.env.close()
 
 
@@ -93,7 +94,23 @@ def make(
     """
     construct = _constructor(name)
     env = _started(name, construct, render)
-    size = _observation_size(name, env.observation_space)
+    try:
+        return _fitted(name, construct, env, position, length_scale, horizon)
+    except BaseException:
+        env.close()
+        raise
+
+
+def _fitted(
+    name: str,
+    construct: Callable[..., Any],
+    env: gymnasium.Env[Any, Any],
+    position: slice | None,
+    length_scale: float | None,
+    horizon: int | None,
+) -> tuple[gymnasium.Env[Any, Any], EnvSpec]:
+    """`make`, of an environment that is built."""
+    size = _observation_size(name, _space(name, env, "observation_space"))
     if position is None:
         raise BadInput(
             f"--env {name} needs --position, the part of the observation that is the end-effector's "
@@ -105,7 +122,7 @@ def make(
     if length_scale is not None and not 0 < length_scale < np.inf:
         raise BadInput(f"--length-scale {length_scale} must be a positive number.")
     env = _rescaled(name, env)
-    told = _probe(name, construct)
+    told = _probe(name, construct, size)
     if "success" not in told and "is_success" in told:
         env = IsSuccess(env)
     spec = EnvSpec(
@@ -179,6 +196,13 @@ def _started(name: str, construct: Callable[..., Any], render: bool) -> gymnasiu
     return Staying(env)
 
 
+def _space(name: str, env: gymnasium.Env[Any, Any], which: str) -> spaces.Space[Any]:
+    try:
+        return getattr(env, which)
+    except Exception as error:
+        raise BadInput(f"The environment {name} has no {which}: {_told(error)}") from error
+
+
 def _observation_size(name: str, space: spaces.Space[Any]) -> int:
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise BadInput(
@@ -190,7 +214,7 @@ def _observation_size(name: str, space: spaces.Space[Any]) -> int:
 
 def _rescaled(name: str, env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
     """The environment with actions in [-1, 1]."""
-    space = env.action_space
+    space = _space(name, env, "action_space")
     if (
         not isinstance(space, spaces.Box)
         or len(space.shape) != 1
@@ -222,13 +246,18 @@ def _horizon(name: str, env: gymnasium.Env[Any, Any], asked: int | None) -> int:
     return min(limits)
 
 
-def _probe(name: str, construct: Callable[..., Any]) -> dict[str, Any]:
+def _probe(name: str, construct: Callable[..., Any], size: int) -> dict[str, Any]:
     """The info of one step, taken on an instance of its own so that the returned one is untouched."""
     env = _started(name, construct, render=False)
     try:
         env.reset(seed=0)
         middle = (env.action_space.low + env.action_space.high) / 2  # pyright: ignore[reportAttributeAccessIssue]
-        return env.step(middle.astype(env.action_space.dtype))[4]
+        observation, reward, _, _, info = env.step(middle.astype(env.action_space.dtype))
+        checked(observation, size)
+        finite("reward", reward)
+        if not isinstance(info, dict):
+            raise BadNumber(f"the info of a step is {info!r}, not a dict.")
+        return info
     except Exception as error:
         raise BadInput(f"The environment {name} fails at its first step: {_told(error)}") from error
     finally:
@@ -236,4 +265,6 @@ def _probe(name: str, construct: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _told(error: Exception) -> str:
+    if isinstance(error, BadNumber):
+        return str(error)
     return f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")

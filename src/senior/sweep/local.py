@@ -13,7 +13,8 @@ from itertools import count
 from pathlib import Path
 
 from senior.processes import importing_alike
-from senior.rundir import threads, told
+from senior.protocol import threads
+from senior.rundir import told
 from senior.sweep.cells import Done, Job, order, outcomes_of
 from senior.sweep.scheduler import LEAVE_SECONDS
 from senior.types import BadInput
