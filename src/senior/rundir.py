@@ -238,6 +238,7 @@ class RunDirectory:
         """Close the files and let go of the lock."""
         if self._board is not None:
             self._board.close()
+            self._board = None
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
