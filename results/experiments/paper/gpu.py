@@ -1,8 +1,8 @@
 """What the runs on a GPU were trained with: ``python gpu.py ARM OUT``, a process for each of the four arms.
 
 All of them at once, under CUDA's MPS, with XLA_PYTHON_CLIENT_MEM_FRACTION=.2 and
-XLA_FLAGS="--xla_gpu_autotune_level=0 --xla_gpu_enable_triton_gemm=false"; broken off when the time was over. For 65 seconds
-a busy loop ran on each idle processor beside them.
+XLA_FLAGS="--xla_gpu_autotune_level=0 --xla_gpu_enable_triton_gemm=false"; broken off when the time was over. For 65
+seconds a busy loop ran on each idle processor beside them.
 """
 
 import sys
