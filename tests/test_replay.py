@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -154,18 +156,29 @@ def test_segments_run_on_across_the_wrap_of_the_ring(facts: int):
 SEGMENT = 4
 
 
-def trainee_in(path: Path, capacity: int | None = None, per_session: int = 40) -> Trainee:
-    """A trainee on the toy; `candidate_starts` looks at its configuration and at its list of episodes."""
-    config = replace(
-        Config(task="point"),
-        steps=500,
-        replay_capacity=capacity,
-        queries=Queries(budget=per_session, per_session=per_session, segment=SEGMENT, episodes=6, pool=10),
-        networks=Networks(1, 4, 1, 4),
-        pretraining=Pretraining(10, 30, 5),
-    )
-    spec = point.make()[1]
-    return Trainee(config, path, Learner(config, spec, parts.bonus(config, spec)), spec)
+MakeTrainee = Callable[..., Trainee]
+
+
+@pytest.fixture
+def make_trainee(tmp_path: Path) -> Iterator[MakeTrainee]:
+    """Makes trainees on the toy; `candidate_starts` looks at their configuration and at their list of episodes."""
+
+    def made(capacity: int | None = None, per_session: int = 40) -> Trainee:
+        config = replace(
+            Config(task="point"),
+            steps=500,
+            replay_capacity=capacity,
+            queries=Queries(budget=per_session, per_session=per_session, segment=SEGMENT, episodes=6, pool=10),
+            networks=Networks(1, 4, 1, 4),
+            pretraining=Pretraining(10, 30, 5),
+        )
+        spec = point.make()[1]
+        trainee = Trainee(config, tmp_path, Learner(config, spec, parts.bonus(config, spec)), spec)
+        opened.callback(trainee.close)
+        return trainee
+
+    with ExitStack() as opened:
+        yield made
 
 
 def episodes_of(lengths: list[int]) -> list[list[int]]:
@@ -184,9 +197,11 @@ def live(trainee: Trainee, lengths: list[int]) -> None:
             step += 1
 
 
-def test_candidates_are_uniform_over_the_episodes_longer_than_a_segment_and_over_their_starts(tmp_path: Path):
+def test_candidates_are_uniform_over_the_episodes_longer_than_a_segment_and_over_their_starts(
+    make_trainee: MakeTrainee,
+):
     """Lengths vary: 4 is too short for a segment of 4, 5 leaves one start, the last step is never included."""
-    trainee = trainee_in(tmp_path, per_session=400)
+    trainee = make_trainee(per_session=400)
     lengths = [9, 4, 5, 6, 3]
     live(trainee, lengths)
     candidates = trainee.candidate_starts(sum(lengths))
@@ -205,14 +220,14 @@ def test_candidates_are_uniform_over_the_episodes_longer_than_a_segment_and_over
     np.testing.assert_allclose(same, 1 / 3, atol=0.04)  # the two of a pair are drawn independently
 
 
-def test_a_candidate_lies_inside_one_episode_and_ends_before_its_last_step(tmp_path: Path):
+def test_a_candidate_lies_inside_one_episode_and_ends_before_its_last_step(make_trainee: MakeTrainee):
     lengths = [7, 12, 4, 5, 30]
     held = replay.init(64, 3, 2)
     for number, _, length in episodes_of(lengths):
         for t in range(length):
             done = t == length - 1
             held = store(held, fact(t, truncated=done, episode=number), np.float32(0), np.float32(0))
-    trainee = trainee_in(tmp_path)
+    trainee = make_trainee()
     live(trainee, lengths)
     candidates = trainee.candidate_starts(sum(lengths))
     assert candidates is not None
@@ -225,29 +240,29 @@ def test_a_candidate_lies_inside_one_episode_and_ends_before_its_last_step(tmp_p
 
 
 @pytest.mark.parametrize("lengths", [[], [9], [9, 4, 3]])
-def test_fewer_than_two_usable_episodes_give_no_candidates(tmp_path: Path, lengths: list[int]):
-    trainee = trainee_in(tmp_path)
+def test_fewer_than_two_usable_episodes_give_no_candidates(make_trainee: MakeTrainee, lengths: list[int]):
+    trainee = make_trainee()
     live(trainee, lengths)
     assert trainee.candidate_starts(sum(lengths)) is None
 
 
-def test_short_episodes_do_not_push_usable_ones_out(tmp_path: Path):
-    trainee = trainee_in(tmp_path)
+def test_short_episodes_do_not_push_usable_ones_out(make_trainee: MakeTrainee):
+    trainee = make_trainee()
     live(trainee, [9, 9, 9] + [4] * 20)
     candidates = trainee.candidate_starts(107)
     assert candidates is not None and set(candidates[1].ravel().tolist()) == {0, 1, 2}
 
 
-def test_an_episode_that_the_ring_has_begun_to_overwrite_is_no_candidate(tmp_path: Path):
-    trainee = trainee_in(tmp_path, capacity=20)
+def test_an_episode_that_the_ring_has_begun_to_overwrite_is_no_candidate(make_trainee: MakeTrainee):
+    trainee = make_trainee(capacity=20)
     live(trainee, [10, 10, 10])  # at step 31 rows 11 to 30 are stored
     candidates = trainee.candidate_starts(30)
     assert candidates is not None and set(candidates[1].ravel().tolist()) == {1, 2}
     assert trainee.candidate_starts(31) is None
 
 
-def test_candidates_of_a_step_are_always_the_same_and_those_of_another_are_not(tmp_path: Path):
-    trainee = trainee_in(tmp_path)
+def test_candidates_of_a_step_are_always_the_same_and_those_of_another_are_not(make_trainee: MakeTrainee):
+    trainee = make_trainee()
     live(trainee, [40, 40])
     one, again, other = (trainee.candidate_starts(step) for step in (80, 80, 85))
     assert one is not None and again is not None and other is not None
