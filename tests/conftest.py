@@ -15,7 +15,7 @@ WORKER = os.environ.get("PYTEST_XDIST_WORKER")
 
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(COMPILED)
-# Operations are not split over threads, as senior.runs.prepare_device sets it, and why. In tests only, machine code
+# Operations are not split over threads, as senior.device.prepare_device sets it, and why. In tests only, machine code
 # is not optimised: most of a first run of the suite is compiling.
 os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=0"
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"

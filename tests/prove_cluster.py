@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from senior.cli.shared import DONE
-from senior.sweep.cells import is_finished, standing
+from senior.rundir import is_finished, standing
 from tests.cluster import two_nodes
 from tests.equal import assert_same_run
 

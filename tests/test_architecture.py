@@ -25,7 +25,7 @@ LAYERS = (
 APART = {"select", "explore", "teachers", "envs"}
 # And all below.
 WITHOUT_JAX = {"types", "files", "processes", "preference_file", "preferences", "envs", "teachers", "rundir", "report"}
-WITHOUT_JAX |= {"label", "label_file", "labels", "protocol", "board", "policy"}
+WITHOUT_JAX |= {"label", "label_file", "labels", "protocol", "tensorboard", "policy"}
 
 
 def module_name(path: Path) -> str:

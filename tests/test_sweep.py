@@ -24,9 +24,9 @@ from senior.cli import main
 from senior.cli.shared import DONE, INTERRUPTED
 from senior.envs.point import Point
 from senior.protocol import threads
-from senior.rundir import HELD, RunDirectory
+from senior.rundir import HELD, RunDirectory, is_finished
 from senior.sweep.board import Board
-from senior.sweep.cells import Cell, Done, Job, Outcome, check_cells, is_finished, job_of, order, outcomes_of, report
+from senior.sweep.cells import Cell, Done, Job, Outcome, check_cells, job_of, order, outcomes_of, report
 from senior.sweep.grid import cells_of, merged, read, split
 from senior.sweep.local import LocalCrew
 from senior.sweep.run import run

@@ -24,12 +24,13 @@ import numpy as np
 from senior import program, protocol, rundir, session
 from senior.checks import check
 from senior.config import Config, Pretraining
+from senior.device import prepare_device
 from senior.fit import spec_of
 from senior.learner import Learner
 from senior.loop import Training
 from senior.methods import METHODS
 from senior.presets import preset
-from senior.runs import Runs, lift_for, prepare_device
+from senior.runs import Runs, lift_for
 from senior.together import Pools
 from senior.trainee import Trainee
 from senior.types import BadInput, EnvSpec

@@ -12,11 +12,11 @@ import numpy as np
 from senior import evaluate, rundir
 from senior.agent.networks import MLP
 from senior.config import load
+from senior.device import prepare_device
 from senior.envs import render
 from senior.envs.episodes import AFTERWARDS, Failure, Local, episode_seed
 from senior.learner import mean_action
 from senior.policy import load_policy
-from senior.runs import prepare_device
 from senior.trainee import made_by, make_environment
 from senior.types import BadInput
 

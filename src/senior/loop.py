@@ -306,8 +306,9 @@ class Training:
                 progress.snapped = step
             if step > progress.step and (step % config.checkpoint_every == 0 or at_end or last):
                 with self.clock.part("checkpoint"):
-                    if not trainee.save(self.runs[i], step):
-                        self.watcher.say(f"{trainee.name} is stopped at step {step}: {trainee.failure}")
+                    diverged = trainee.save(self.runs[i], step)
+                if diverged:
+                    self.fail(i, step, diverged)
             trainee.done = at_end
 
     def evaluate(self, judged: Sequence[int], step: int) -> None:
@@ -381,11 +382,11 @@ class Training:
     def fail(self, i: int, step: int, message: str) -> None:
         """Stop one run, with a checkpoint at the beginning of ``step``; the others go on."""
         trainee = self.trainees[i]
-        trainee.failure = message
         if step > trainee.progress.step:
-            trainee.save(self.runs[i], step)
+            message = trainee.save(self.runs[i], step) or message
+        trainee.failure = message
         kept = ", with a checkpoint" if step and trainee.progress.step == step else ""
-        self.watcher.say(f"{trainee.name} is stopped at step {step}{kept}: {trainee.failure}")
+        self.watcher.say(f"{trainee.name} is stopped at step {step}{kept}: {message}")
 
 
 def _fact(trainee: Trainee, happened: Step | None) -> Fact:

@@ -10,14 +10,14 @@ from pathlib import Path
 
 from senior import checkpoint, parts, protocol, rundir
 from senior.config import Config, load
+from senior.device import prepare_device
 from senior.envs.drawing import NoVideo, prepare_opengl
-from senior.files import json_object
 from senior.fit import check_fit, check_offered, spec_of
 from senior.label.address import Address
 from senior.label.serving import check_installed
 from senior.learner import Learner
 from senior.loop import Watcher
-from senior.runs import Lift, prepare_device
+from senior.runs import Lift
 from senior.shape import shape
 from senior.together import Pools, Result, Waiting, check_page, train_waiting, unopened
 from senior.trainee import Trainee
@@ -253,8 +253,8 @@ def resume(
 def _finished(run: Path, config: Config) -> Result | None:
     """What came of a run that has told that it is finished, without opening it; None if something is left to do."""
     stood = checkpoint.standing(run / "checkpoints")
-    told = json_object(run / "status.json").get("phase") == "finished" and (run / "plots").is_dir()
-    if stood is None or stood["step"] < config.steps or not told:
+    told_and_drawn = rundir.is_finished(run) and (run / "plots").is_dir()
+    if stood is None or stood["step"] < config.steps or not told_and_drawn:
         return None
     return Result(run, config.seed, stood["step"], True, None, stood["labels"], stood["success"])
 
@@ -262,7 +262,7 @@ def _finished(run: Path, config: Config) -> Result | None:
 def _is_over(run: Path) -> bool:
     """Whether a run has no steps to take."""
     try:
-        return next(iter(rundir.saved_steps(run / "checkpoints")), -1) >= load(run / "config.json").steps
+        return rundir.saved_step(run) >= load(run / "config.json").steps
     except BadInput:
         return False
 

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from senior import protocol
-from senior.board import Board
 from senior.config import Config, differences, load, to_json
 from senior.files import Damaged, hold, json_object, pack, unpack, write_atomically
+from senior.tensorboard import Board
 from senior.types import BadInput, EnvSpec
 
 EVAL = ("step", "labels", "queried", "episodes", "success_rate", "return_mean", "return_std")
@@ -135,7 +135,7 @@ class RunDirectory:
         at = 0
         with suppress(OSError, KeyError, ValueError), open(self.path / "eval.csv", newline="") as file:
             at = max([int(row["step"]) for row in csv.DictReader(file)], default=0)
-        if at > first or json_object(self.path / "status.json").get("phase") == "finished":
+        if at > first or is_finished(self.path):
             raise BadInput(
                 f"The checkpoints of the run in {self.path} are gone, so it cannot go on. Its results are kept; to "
                 "train it anew, name another directory."
@@ -143,7 +143,7 @@ class RunDirectory:
 
     def check_fits(self, spec: EnvSpec) -> None:
         """`BadInput` if the environment is no longer what the run began with."""
-        now = json.loads(json.dumps(protocol.of_environment(spec)))
+        now = protocol.of_environment(spec)
         for name, held in protocol.read(self.path).items():
             if name in now and now[name] != held:
                 raise BadInput(
@@ -298,6 +298,21 @@ def saved_steps(checkpoints: Path) -> list[int]:
     """Steps at which there are checkpoints in that folder of a run, newest first."""
     found = (_CHECKPOINT.fullmatch(path.name) for path in checkpoints.glob("step-*.npz"))
     return sorted((int(match[1]) for match in found if match), reverse=True)
+
+
+def saved_step(path: Path) -> int:
+    """The step of a run's newest checkpoint; -1: there is none."""
+    return next(iter(saved_steps(path / "checkpoints")), -1)
+
+
+def standing(path: Path) -> dict[str, Any]:
+    """What a run says that it is doing: phase, step, labels, success and so on; empty if nothing can be read."""
+    return json_object(path / "status.json")
+
+
+def is_finished(path: Path) -> bool:
+    """Whether a run says that it is finished. One that is and does not say so is found out when it is opened."""
+    return standing(path).get("phase") == "finished"
 
 
 def _text(value: Any) -> str:

@@ -32,9 +32,10 @@ def hold(
     pause: waits a moment, told whether it is the first; False: the run is to be left as it was saved before it asked.
     Returns None, or in a sentence why the run cannot go on.
     """
-    before = parts.takes_time(trainee.config) and step > trainee.progress.step  # whatever befalls it while it waits
-    if before and not trainee.save(runs[i], step):
-        return trainee.failure
+    if parts.takes_time(trainee.config) and step > trainee.progress.step:
+        diverged = trainee.save(runs[i], step)  # whatever befalls it while it waits
+        if diverged:
+            return diverged
     if not ask(trainee, runs, i, step, n, warn):
         return None
     refused, first = listen(trainee), True

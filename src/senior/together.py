@@ -15,13 +15,14 @@ import numpy as np
 
 from senior import checkpoint, protocol
 from senior.config import Config
+from senior.device import device_memory
 from senior.envs.workers import Worker, Workers
 from senior.label.address import Address, check_address
 from senior.label.serving import Serving
 from senior.learner import Learner, Run
 from senior.loop import Training, Watcher
 from senior.report.curves import learning_curve
-from senior.runs import Lift, Runs, device_memory, lift_for, state_bytes
+from senior.runs import Lift, Runs, lift_for, state_bytes
 from senior.trainee import Trainee
 from senior.types import BadInput
 

@@ -228,25 +228,24 @@ class Trainee:
             self.reset(progress.episode)
         return run
 
-    def save(self, run: Run, step: int) -> bool:
-        """Write the policy and a checkpoint at the beginning of ``step``; False: not of networks that have diverged,
-        which is a failure.
+    def save(self, run: Run, step: int) -> str | None:
+        """Write the policy and a checkpoint at the beginning of ``step``. Returns None, or in a sentence that the
+        networks have diverged: they are not saved.
 
         The policy first: a run that is killed between the two then writes it again, where the other way round one
         killed after its last checkpoint would keep an older policy for ever.
         """
         progress = self.progress
         if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((run.agent, run.model))):
-            self.failure = (
+            return (
                 f"Its networks have diverged: by step {step} they hold numbers that are not finite. What was saved at "
                 f"step {progress.step} is kept; lower the rates of --sac or --reward."
             )
-            return False
         self.directory.save_policy({**policy_arrays(run), "step": np.asarray(step)})
         progress.step = step
         progress.lengths = self.directory.lengths()
         progress.written = checkpoint.save(self.directory.checkpoints, step, run, asdict(progress), progress.written)
-        return True
+        return None
 
     def tell(self, phase: str, step: int) -> None:
         """Tell whoever looks on from outside what the run is doing; twice a second at most.

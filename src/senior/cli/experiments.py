@@ -15,8 +15,9 @@ from senior.cli.display import stop_when_asked
 from senior.cli.shared import DONE, FAILED, INTERRUPTED
 from senior.extras import require
 from senior.options import parse
+from senior.rundir import is_finished, standing
 from senior.sweep import grid
-from senior.sweep.cells import Cell, check_cells, is_finished, standing
+from senior.sweep.cells import Cell, check_cells
 from senior.types import BadInput
 
 

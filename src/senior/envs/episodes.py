@@ -8,25 +8,20 @@ environment, bit for bit, which is how runs are resumed, dead workers replaced a
 from __future__ import annotations
 
 import contextlib
-import sysconfig
-import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
 
+from senior.envs.numbers import cause, checked, finite, raised_at
 from senior.types import EnvSpec
 
 TRAINING = 0
 EVALUATION = 1
 AFTERWARDS = 2
 """Purposes of episodes: training, evaluation within it and `senior eval` never share one."""
-
-LARGEST = float(np.finfo(np.float32).max)
-OURS, PYTHONS = Path(__file__).parents[1], Path(sysconfig.get_path("stdlib"))
 
 
 class Step(NamedTuple):
@@ -182,48 +177,8 @@ class Local:
         return None
 
     def _fail(self, error: Exception) -> Failure:
-        cause = str(error) if isinstance(error, BadNumber) else f"{type(error).__name__}: {error}{_raised_at(error)}"
         self.failure = Failure(
             f"The environment {self.spec.name} of seed {self.seed} failed in episode "
-            f"{self.episode} after step {self.elapsed}: {' '.join(cause.split())}"
+            f"{self.episode} after step {self.elapsed}: {cause(error)}{raised_at(error)}"
         )
         return self.failure
-
-
-def _raised_at(error: BaseException) -> str:
-    """Where an error came from: the last line that is neither of this package, nor of Python, nor of one installed."""
-    for raised in filter(None, (error, error.__cause__)):
-        for frame in reversed(traceback.extract_tb(raised.__traceback__)):
-            file = Path(frame.filename)
-            if not {OURS, PYTHONS} & {*file.parents} and "site-packages" not in file.parts:
-                return f" ({file.name}, line {frame.lineno})"
-    return ""
-
-
-class BadNumber(Exception):
-    """The environment gave a number or a shape that no learner can use."""
-
-
-def checked(observation: Any, size: int) -> np.ndarray:
-    """A float32 copy of an observation, checked: [size] and finite. Raises `BadNumber`."""
-    with np.errstate(over="ignore"):  # beyond float32 becomes infinite, and is told below
-        copy = np.array(observation, np.float32)
-    if copy.shape != (size,):
-        raise BadNumber(f"the observation has shape {copy.shape} instead of ({size},).")
-    if not np.isfinite(copy).all():
-        where = int(np.flatnonzero(~np.isfinite(copy))[0])
-        raise BadNumber(f"the observation is {copy[where]} at index {where}.")
-    return copy
-
-
-def finite(what: str, value: Any) -> float:
-    """A number that float32 can hold, or the one in an array of one. Raises `BadNumber`."""
-    if np.size(value) != 1:
-        raise BadNumber(f"the {what} is an array of shape {np.shape(value)}.")
-    try:
-        number = float(np.asarray(value).item())
-    except (TypeError, ValueError):
-        raise BadNumber(f"the {what} is {value!r}.") from None
-    if not abs(number) <= LARGEST:
-        raise BadNumber(f"the {what} is {number}.")
-    return number

@@ -19,7 +19,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import RescaleAction, TimeLimit, TransformAction
 
-from senior.envs.episodes import BadNumber, checked, finite
+from senior.envs.numbers import BadNumber, cause, checked, finite
 from senior.types import BadInput, EnvSpec
 
 
@@ -154,7 +154,7 @@ def _constructor(name: str) -> Callable[..., Any]:
         with _staying():
             module = importlib.import_module(module_name)
     except Exception as error:
-        raise BadInput(f"The module of --env {name} cannot be imported: {_told(error)}") from error
+        raise BadInput(f"The module of --env {name} cannot be imported: {cause(error)}") from error
     if attribute in gymnasium.registry:
         return _registered(attribute)
     construct: Any = getattr(module, attribute, None)
@@ -190,7 +190,7 @@ def _started(name: str, construct: Callable[..., Any], render: bool) -> gymnasiu
             else:
                 env = construct()
     except Exception as error:
-        raise BadInput(f"The environment {name} cannot be built: {_told(error)}") from error
+        raise BadInput(f"The environment {name} cannot be built: {cause(error)}") from error
     if not isinstance(env, gymnasium.Env):
         raise BadInput(f"--env {name} gives a {type(env).__name__}, not a Gymnasium environment.")
     return Staying(env)
@@ -200,7 +200,7 @@ def _space(name: str, env: gymnasium.Env[Any, Any], which: str) -> spaces.Space[
     try:
         return getattr(env, which)
     except Exception as error:
-        raise BadInput(f"The environment {name} has no {which}: {_told(error)}") from error
+        raise BadInput(f"The environment {name} has no {which}: {cause(error)}") from error
 
 
 def _observation_size(name: str, space: spaces.Space[Any]) -> int:
@@ -259,12 +259,6 @@ def _probe(name: str, construct: Callable[..., Any], size: int) -> dict[str, Any
             raise BadNumber(f"the info of a step is {info!r}, not a dict.")
         return info
     except Exception as error:
-        raise BadInput(f"The environment {name} fails at its first step: {_told(error)}") from error
+        raise BadInput(f"The environment {name} fails at its first step: {cause(error)}") from error
     finally:
         env.close()
-
-
-def _told(error: Exception) -> str:
-    if isinstance(error, BadNumber):
-        return str(error)
-    return f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")

@@ -10,8 +10,8 @@ from typing import Any
 
 from senior.config import Config
 from senior.envs.metaworld import TASKS
-from senior.files import json_object
 from senior.label.desk import Assignment, Desk
+from senior.rundir import standing
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Standing:
 def trainer(run: Path) -> dict[str, Any]:
     """What the trainer is doing: phase and a sentence."""
     try:
-        told = json_object(run / "status.json")
+        told = standing(run)
         phase, step, steps = told["phase"], told["step"], told["steps"]
     except KeyError:
         return {"phase": "starting", "text": "The run has not begun."}

@@ -12,7 +12,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from senior.sweep.cells import Cell, standing
+from senior.rundir import standing
+from senior.sweep.cells import Cell
 from senior.sweep.scheduler import Sweep
 
 REDRAW_SECONDS = 2.0

@@ -6,13 +6,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from senior import parts
 from senior.config import Config, from_json, made_by, to_json
-from senior.files import json_object
 from senior.fit import check_fit, check_offered, spec_of
-from senior.rundir import RunDirectory, saved_steps
+from senior.rundir import RunDirectory
 from senior.types import BadInput, EnvSpec
 
 
@@ -76,27 +75,12 @@ def check_cells(cells: Sequence[Cell]) -> None:
             directory.check_free()
 
 
-def standing(path: Path) -> dict[str, Any]:
-    """What a run says that it is doing: phase, step, labels, success and so on; empty if nothing can be read."""
-    return json_object(path / "status.json")
-
-
 def opened_at(path: Path) -> int:
     """When a run last said anything, in nanoseconds; 0: it never did."""
     try:
         return (path / "status.json").stat().st_mtime_ns
     except OSError:
         return 0
-
-
-def is_finished(path: Path) -> bool:
-    """Whether a run says that it is finished. One that is and does not say so is found out when it is opened."""
-    return standing(path).get("phase") == "finished"
-
-
-def saved_step(path: Path) -> int:
-    """The step of a run's newest checkpoint; -1: there is none."""
-    return next(iter(saved_steps(path / "checkpoints")), -1)
 
 
 def order(job: Job) -> str:

@@ -41,7 +41,7 @@ class Hand:
         """Start JAX; a sentence if this is no place for a sweep, else nothing."""
         if os.environ.get("RAY_AUTH_MODE") != "token":
             return "The Ray cluster does not ask for a token: start it with RAY_AUTH_MODE=token (docs/experiments.md)."
-        from senior.runs import prepare_device
+        from senior.device import prepare_device
 
         try:
             prepare_device(wanted)

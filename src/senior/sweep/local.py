@@ -156,7 +156,7 @@ def find_device(device: str) -> str:
     """cpu or gpu; asked in a process of its own, so that this one never holds a GPU's memory."""
     if device == "cpu":
         return device
-    program = "import sys\nfrom senior.runs import prepare_device\nfrom senior.types import BadInput\n"
+    program = "import sys\nfrom senior.device import prepare_device\nfrom senior.types import BadInput\n"
     program += f"try:\n    print(prepare_device({device!r}))\nexcept BadInput as error:\n    sys.exit(str(error))\n"
     asked = subprocess.run(
         [sys.executable, "-c", program],

@@ -7,8 +7,8 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from typing import Protocol
 
-from senior.rundir import HELD
-from senior.sweep.cells import Cell, Done, Job, Outcome, is_finished, opened_at, saved_step, standing
+from senior.rundir import HELD, is_finished, saved_step, standing
+from senior.sweep.cells import Cell, Done, Job, Outcome, opened_at
 
 RETRIES = 3
 """How often a cell that failed is tried again."""
