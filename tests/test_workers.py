@@ -84,6 +84,18 @@ def pool(treachery: Path) -> Iterator[Workers]:
     workers.close()
 
 
+def test_a_worker_imports_from_where_this_process_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Not first from the working directory, where a user's module may have the name of one of Python's."""
+    (tmp_path / "json.py").write_text("raise RuntimeError('not the module json that was meant')\n")
+    monkeypatch.chdir(tmp_path)
+    pool = Workers(1)
+    try:
+        remote, _ = pair(pool, made_by("Forgetful"), 0)
+        assert remote.begin(0) is None
+    finally:
+        pool.close()
+
+
 def made_by(env: str | None = None, task: str | None = None) -> dict[str, Any]:
     return {
         "task": task,

@@ -7,5 +7,9 @@ import sys
 
 
 def importing_alike() -> dict[str, str]:
-    """Environment variables for a process of ours: what is importable here is importable there."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    """Environment variables for a process of ours: it imports what this one does, from the same places.
+
+    Left to itself, Python would look into the working directory first, where a user's ``queue.py`` hides its own.
+    """
+    places = [place or os.getcwd() for place in sys.path]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(places), "PYTHONSAFEPATH": "1"}
