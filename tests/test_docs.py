@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from senior.rundir import TABLES
+
 ROOT = Path(__file__).parent.parent
 CELL = re.compile(r"`([^`]*)`")
 NAMED = re.compile(r"(?:(test_\w+\.py))?(?: ?-k (\w+))?")
@@ -29,3 +31,12 @@ def test_every_row_of_the_conformance_page_names_tests_that_exist():
                 assert name and re.search(rf"def test_\w*{name}", source), f"{file or default} has no {name}"
             rows += 1
     assert rows > 80
+
+
+def test_every_column_of_a_run_is_told():
+    parts = (ROOT / "docs" / "run-directory.md").read_text().split("\n## ")
+    told = {part.split(":")[0]: part for part in parts if ".csv:" in part}
+    assert told.keys() == TABLES.keys()
+    for table, columns in TABLES.items():
+        rows = [line.split("|")[1] for line in told[table].splitlines() if line.startswith("| `")]
+        assert sorted(CELL.findall("".join(rows))) == sorted(columns)
