@@ -58,6 +58,17 @@ def test_custom_selection(tmp_path: Path):
     assert f"session 1: {asked[-1][1]}" in told
 
 
+def test_custom_bonus(tmp_path: Path):
+    told, path = run("custom_bonus", tmp_path)
+    train = rows(path / "train.csv")
+    paid = [(int(row["labels"]), float(row["beta"]), float(row["bonus_mean"])) for row in train if row["beta"]]
+    assert {labels for labels, *_ in paid} >= {20, 40}
+    for labels, beta, bonus in paid:
+        assert beta == pytest.approx(0.1 if labels else 0)
+        assert 0 < bonus <= 0.1 if labels else bonus == 0
+    assert f"{paid[-1][-1]:.3f} a row" in told
+
+
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
 def test_an_example_is_short_and_says_how_to_run_it(path: Path):
     text = path.read_text()
@@ -75,7 +86,7 @@ def test_the_command_in_an_example_is_one(path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(program, "train", lambda config, out, *_, **_options: asked.append((config, out)) or [])
     assert cli.main(command[1].split()) == cli.DONE
     ((config, out),) = asked
-    assert f"{path.stem}:" in f"{config.env} {config.method.select}"
+    assert f"{path.stem}:" in f"{config.env} {config.method.select} {config.method.explore}"
     assert str(out) == command[1].split()[-1]
     monkeypatch.syspath_prepend(str(EXAMPLES))
     if config.env:
