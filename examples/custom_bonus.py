@@ -3,8 +3,8 @@
     python examples/custom_bonus.py
 
 takes half a minute, enough to see that everything fits together. A bonus is any class like `Nearness`: functions of
-JAX arrays that are compiled, so its state keeps its shapes and what depends on numbers is computed, not branched on.
-It is named as module:Name, on the command line too, in the directory of this file:
+JAX arrays that are compiled, so its state keeps shapes and types, and what depends on numbers is computed, not branched
+on. It is named as module:Name, on the command line too, in the directory of this file:
 
     senior train --task door-close --method pebble --explore custom_bonus:Nearness --out runs/nearness
 """
@@ -30,7 +30,7 @@ class Nearness:
     def on_session(self, state, key, preferred, count):
         """Of preferred [n, d] the first count rows are positions of preferred segments; the rest is room."""
         held = (jnp.arange(len(preferred)) < count)[:, None]
-        return (preferred * held).sum(axis=0) / jnp.maximum(count, 1), jnp.where(count > 0, 0.1, 0.0)
+        return (preferred * held).sum(axis=0) / jnp.maximum(count, 1), jnp.float32(0.1) * (count > 0)
 
     def on_refresh(self, state, key, replay, now):
         return state  # called every --refresh-every steps, for what looks at the whole replay

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import re
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -84,13 +86,28 @@ def pool(treachery: Path) -> Iterator[Workers]:
     workers.close()
 
 
+class Attached(Point):
+    """A point with a simulator that it starts, of two files that lie side by side."""
+
+    def __init__(self) -> None:
+        super().__init__(horizon=6)
+        subprocess.run([sys.executable, os.environ["SIMULATOR"]], check=True)
+
+
 def test_a_worker_imports_from_where_this_process_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Not first from the working directory, where a user's module may have the name of one of Python's."""
+    """Not first from the working directory, where a user's module may have the name of one of Python's.
+
+    What its environments start looks where Python always does.
+    """
+    (tmp_path / "simulator").mkdir()
+    (tmp_path / "simulator" / "main.py").write_text("import beside\n")
+    (tmp_path / "simulator" / "beside.py").touch()
     (tmp_path / "json.py").write_text("raise RuntimeError('not the module json that was meant')\n")
+    monkeypatch.setenv("SIMULATOR", str(tmp_path / "simulator" / "main.py"))
     monkeypatch.chdir(tmp_path)
     pool = Workers(1)
     try:
-        remote, _ = pair(pool, made_by("Forgetful"), 0)
+        remote, _ = pair(pool, made_by("Attached"), 0)
         assert remote.begin(0) is None
     finally:
         pool.close()

@@ -1,4 +1,4 @@
-"""A run's directory: its files, their columns, and how long each was at a checkpoint (README, "The run directory").
+"""A run's directory: its files, their columns, and how long each was at a checkpoint (docs/run-directory.md).
 
 CSV files are the truth; TensorBoard mirrors them. Nothing that depends on the clock is written outside
 ``timing.csv`` (whose length checkpoints remember), ``tensorboard/``, ``status.json`` and the time of an answer, so

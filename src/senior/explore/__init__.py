@@ -40,7 +40,7 @@ class Now(NamedTuple):
 class Bonus(Protocol):
     """What is paid on top of the learned reward in the critics' target: pure traced functions of one run.
 
-    Built as ``Name(spec)``. The state is a pytree whose shapes never change.
+    Built as ``Name(spec)``. The state is a pytree whose shapes and types never change.
     """
 
     def init(self) -> Any:

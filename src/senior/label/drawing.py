@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
 
-from senior.processes import importing_alike
+from senior.processes import OURS, importing_alike
 
 
 class Drawing:
@@ -32,7 +31,7 @@ class Drawing:
         pause = 1.0
         while not self._over.is_set():
             began = time.monotonic()
-            command = [sys.executable, "-m", "senior.label.clips", str(self.run)]
+            command = [*OURS, "-m", "senior.label.clips", str(self.run)]
             self._process = subprocess.Popen(command, stdin=subprocess.PIPE, env=importing_alike())
             if self._over.is_set():
                 self._process.terminate()

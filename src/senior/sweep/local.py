@@ -7,12 +7,11 @@ import os
 import selectors
 import signal
 import subprocess
-import sys
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
-from senior.processes import importing_alike
+from senior.processes import OURS, importing_alike
 from senior.protocol import threads
 from senior.rundir import told
 from senior.sweep.cells import Done, Job, order, outcomes_of
@@ -96,7 +95,7 @@ class LocalCrew:
         orders, give = os.pipe()
         hear, answers = os.pipe()
         os.set_blocking(hear, False)
-        command = [sys.executable, "-m", "senior.sweep.worker", str(orders), str(answers), str(self._threads)]
+        command = [*OURS, "-m", "senior.sweep.worker", str(orders), str(answers), str(self._threads)]
         with open(log, "a") as file:
             process = subprocess.Popen(
                 command,
@@ -159,7 +158,7 @@ def find_device(device: str) -> str:
     program = "import sys\nfrom senior.device import prepare_device\nfrom senior.types import BadInput\n"
     program += f"try:\n    print(prepare_device({device!r}))\nexcept BadInput as error:\n    sys.exit(str(error))\n"
     asked = subprocess.run(
-        [sys.executable, "-c", program],
+        [*OURS, "-c", program],
         env=importing_alike(),
         capture_output=True,
         text=True,
