@@ -166,6 +166,21 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_serves(
     assert_equal(again[1], run)
 
 
+@pytest.mark.parametrize("which", ["checkpoint", "chunk"])
+def test_what_the_system_does_not_give_is_not_taken_for_damaged(which: str, tmp_path: Path):
+    """None is passed over for one before it, which would delete what is newer."""
+    saved(tmp_path, 2, 5)
+    path = tmp_path / (name(5) if which == "checkpoint" else "facts-0000000002-0000000005.npz")
+    aside = path.rename(tmp_path / "aside")
+    path.mkdir()  # whoever the user is, it cannot be read
+    with pytest.raises(IsADirectoryError):
+        newest(tmp_path, empty, pytest.fail)
+    path.rmdir()
+    aside.rename(path)
+    found = newest(tmp_path, empty, pytest.fail)
+    assert found is not None and found[0] == 5
+
+
 def test_missing_facts_are_damage_too(tmp_path: Path):
     saved(tmp_path, 2, 5)
     (tmp_path / "facts-0000000002-0000000005.npz").unlink()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -233,6 +234,27 @@ def test_a_disk_that_is_full_for_tensorboard_keeps_no_row_from_its_table(
         found += [(event.step, value.tag, value.simple_value) for value in event.summary.value]
         written = written[16 + length :]
     assert found == [(0, "eval/return_mean", 1.5), (0, "eval/return_std", 2.0)]
+
+
+def test_positions_that_cannot_be_read_for_a_moment_are_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    directory, first, second = RunDirectory(tmp_path), np.zeros((5, 2)), np.ones((5, 2))
+    directory.snapshot(10, first, {})
+    kept = (tmp_path / "positions.npz").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "read_bytes", lambda path: raise_it(OSError(errno.EIO, "Input/output error", str(path))))
+        with pytest.raises(OSError, match="Input/output error"):
+            directory.snapshot(20, second, {})
+    assert (tmp_path / "positions.npz").read_bytes() == kept
+    directory.snapshot(20, second, {})
+    found = unpack(tmp_path / "positions.npz")
+    assert {name: array.tolist() for name, array in found.items()} == {
+        "step-0000000010": first.tolist(),
+        "step-0000000020": second.tolist(),
+    }
+
+
+def raise_it(error: Exception) -> Any:
+    raise error
 
 
 def test_all_runs_stop_when_all_break(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

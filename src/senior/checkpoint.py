@@ -85,7 +85,7 @@ def restore(directory: Path, step: int, template: Run) -> tuple[Run, dict[str, A
 def standing(directory: Path) -> dict[str, Any] | None:
     """The progress in the newest checkpoint that can be read, without the rest of it; None if there is none."""
     for step in saved_steps(directory):
-        with contextlib.suppress(Damaged, KeyError, ValueError):
+        with contextlib.suppress(Damaged, OSError, KeyError, ValueError):
             return json.loads(unpack(directory / f"step-{step:010d}.npz")["about"].tobytes())["progress"]
     return None
 
@@ -96,7 +96,8 @@ def newest(
     """The newest checkpoint that can be read as (step, run, progress); None if there is none.
 
     A damaged one is named through ``tell``, and the one before is tried. What is newer than the one that is read
-    is deleted: it will be written again, and must not count among those that are kept.
+    is deleted: it will be written again, and must not count among those that are kept. Raises `OSError`, and deletes
+    nothing, if the system does not give one.
     """
     for leftover in directory.glob("*.tmp"):
         leftover.unlink()

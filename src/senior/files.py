@@ -82,13 +82,15 @@ def pack(arrays: dict[str, np.ndarray], compress: bool = False) -> bytes:
 
 
 def unpack(path: Path) -> dict[str, np.ndarray]:
-    """Read an ``.npz`` file whole, checksums included; `Damaged` if that fails.
+    """Read an ``.npz`` file whole, checksums included; `Damaged` if its bytes are not one.
 
     A member's checksum is verified before its bytes are parsed. Damage makes the decompressor and the parser fail
-    in more ways than can be listed, so any failure counts.
+    in more ways than can be listed, so any failure counts. A file that the system does not give (`OSError`) is not
+    damaged: another time it may.
     """
+    content = path.read_bytes()
     try:
-        with zipfile.ZipFile(path) as file:
+        with zipfile.ZipFile(io.BytesIO(content)) as file:
             members = {name.removesuffix(".npy"): file.read(name) for name in file.namelist()}
         return {
             name: np.lib.format.read_array(io.BytesIO(member), allow_pickle=False) for name, member in members.items()

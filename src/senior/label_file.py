@@ -264,7 +264,8 @@ def _segments(file: Path, segments_file: Path, header: Mapping[str, Any]) -> tup
     if not segments_file.exists():
         raise BadInput(f"{file} needs {segments_file.name} beside it, which holds its segments and is not there.")
     try:
-        found = unpack(segments_file)
+        with told(segments_file):
+            found = unpack(segments_file)
     except Damaged as error:
         raise BadInput(f"{segments_file.parent}/{error}.") from error
     sizes = shapes(header["pairs"], header["steps"], header["observation"], header["action"])

@@ -43,5 +43,5 @@ def load_policy(run: Path | str) -> Policy:
         layers = range(sum(name.startswith("weight_") for name in saved))
         weights, biases = (tuple(saved[f"{kind}_{i}"] for i in layers) for kind in ("weight", "bias"))
         return Policy(int(saved["step"]), weights, biases)
-    except (Damaged, KeyError) as error:
+    except (Damaged, OSError, KeyError) as error:
         raise BadInput(f"The policy of {run} cannot be read: {error}.") from error

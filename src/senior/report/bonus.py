@@ -121,7 +121,7 @@ def samples(run: Run, path: Path) -> Samples:
         held = unpack(path)
         preferred, explored, intrinsic = (np.asarray(held[name], float) for name in Samples._fields[:3])
         beta, scale = float(held["beta"]), held.get("length_scale")
-    except (Damaged, KeyError, TypeError, ValueError) as error:
+    except (Damaged, OSError, KeyError, TypeError, ValueError) as error:
         raise Unusable(f"bonus/{path.name} cannot be used: {error}") from error
     shapes = preferred.ndim == explored.ndim == 2 and preferred.shape[1] == explored.shape[1]
     if not (shapes and len(preferred) and intrinsic.shape == explored.shape[:1] and len(explored)):

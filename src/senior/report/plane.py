@@ -97,7 +97,7 @@ def visited(run: Run) -> dict[int, np.ndarray]:
         return {}
     try:
         found = {int(name.removeprefix("step-")): np.asarray(array, float) for name, array in unpack(path).items()}
-    except (Damaged, ValueError) as error:
+    except (Damaged, OSError, ValueError) as error:
         raise Unusable(f"{POSITIONS} cannot be used: {error}") from error
     if any(array.ndim != 2 or not len(array) or not np.isfinite(array).all() for array in found.values()):
         raise Unusable(f"{POSITIONS} is damaged: it holds something else than positions")
