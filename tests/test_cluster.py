@@ -112,9 +112,9 @@ def test_without_its_token_a_cluster_is_of_no_use(cluster: Cluster, tmp_path: Pa
 
 
 def test_an_address_where_nobody_listens_is_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setenv("RAY_AUTH_TOKEN", "0" * 64)
     monkeypatch.setenv("RAY_AUTH_MODE", "token")
-    assert main([*SWEEP, "--out", "never", "--ray", "127.0.0.1:9"]) == BAD_INPUT
+    assert main([*SWEEP, "--out", str(tmp_path / "never"), "--ray", "127.0.0.1:9"]) == BAD_INPUT
     assert "No Ray cluster answers at 127.0.0.1:9" in capsys.readouterr().err
