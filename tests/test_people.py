@@ -216,19 +216,24 @@ def test_a_session_is_put_off_while_the_one_before_it_is_not_answered(tmp_path: 
 
 
 def test_until_there_is_a_label_every_session_is_waited_for(tmp_path: Path):
-    asked = count()
+    run = tmp_path / "seed-0"
 
-    def slow_to_tell(returns: np.ndarray) -> Side:
-        number = next(asked)
-        if number == 10:
-            time.sleep(1.5)  # in which a run that does not wait takes some hundred steps
-        return "skip" if number < 10 else better(returns)
+    class Skipping(Stop):
+        """Skips the whole first session, and answers the last, which is not waited for any more, in time."""
 
-    watcher = Stop()
-    with person(tmp_path / "seed-0", slow_to_tell):
-        (result,) = train(taught(wait=False), tmp_path, watcher=watcher)
-    assert result.labels >= 10  # the last session is not waited for
-    found = labels(tmp_path / "seed-0")
+        def say(self, sentence: str) -> None:
+            super().say(sentence)
+            if "waits for answers" in sentence:
+                answer(run, 10, better if "at step 600" in sentence else lambda _: "skip")
+
+        def advance(self, step: int, trainees: object) -> None:
+            if step == 871:
+                answer(run, 5)
+
+    watcher = Skipping()
+    (result,) = train(taught(wait=False), tmp_path, watcher=watcher)
+    assert result.labels == 15
+    found = labels(run)
     assert {(session, at, learned) for session, at, learned, _ in found[:20]} == {(0, 400, 400), (1, 600, 600)}
     assert [said for said in watcher.said if "waits for answers at step 600" in said]
 
