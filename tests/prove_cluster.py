@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from senior.cli.shared import DONE
-from senior.rundir import is_finished, standing
+from senior.rundir import is_finished, status
 from tests.cluster import two_nodes
 from tests.equal import assert_same_run
 
@@ -42,11 +42,11 @@ def test_a_worker_is_killed_every_minute(tmp_path: Path):
         sweep = subprocess.Popen([*program, "--out", out, "--ray", cluster.address], env=cluster.environment)
         while sweep.poll() is None:
             time.sleep(EVERY)
-            under_way = [run for run in runs if standing(run) and not is_finished(run)]
+            under_way = [run for run in runs if status(run) and not is_finished(run)]
             if under_way and sweep.poll() is None:
                 kills += 1
                 try:
-                    os.kill(standing(draw.choice(under_way))["process"], signal.SIGKILL)
+                    os.kill(status(draw.choice(under_way))["process"], signal.SIGKILL)
                 except ProcessLookupError:  # it waits for its turn after an earlier kill
                     kills -= 1
     assert sweep.returncode == DONE

@@ -255,7 +255,7 @@ def building(
     program.chmod(0o755)
     place.mkdir()
     monkeypatch.setattr(watch, "LOOK_SECONDS", 0.02)
-    monkeypatch.setattr(watch, "OURS", [str(program)])
+    monkeypatch.setattr(watch, "PYTHON", [str(program)])
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     builder = Builder([place], least)
     try:
@@ -319,7 +319,7 @@ def test_a_report_that_fails_is_told_and_the_next_one_is_tried(
         assert fine.folder is not None and fine.folder.name in kept_folders
         flag.touch()
         with monkeypatch.context() as patch:
-            patch.setattr(watch, "OURS", [str(tmp_path / "nowhere")])  # as where there is no room for a process
+            patch.setattr(watch, "PYTHON", [str(tmp_path / "nowhere")])  # as where there is no room for a process
             grow(run, 30_001)
             until(builder, lambda shown: "FileNotFoundError" in shown.trouble)
         until(builder, lambda shown: not shown.trouble)

@@ -62,11 +62,7 @@ def _keep_memory() -> None:
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
-        for parameter, value in (
-            (-3, 2**25),
-            (-1, 2**30),
-            (-2, 2**26),
-        ):  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_TOP_PAD
+        for parameter, value in ((-3, 2**25), (-1, 2**30), (-2, 2**26)):  # MMAP_THRESHOLD, TRIM_THRESHOLD, TOP_PAD
             mallopt(parameter, value)
 
 

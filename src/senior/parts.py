@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import importlib
-import os
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from senior.config import Answering, Config
 from senior.explore import BONUSES, Bonus
+from senior.processes import look_here
 from senior.select import RULES, Rule
 from senior.teachers import TEACHERS, Teacher, recorded, scripted
 from senior.types import BadInput, EnvSpec
@@ -22,8 +21,7 @@ def load(name: str, known: dict[str, str], kind: str) -> Any:
     if ":" not in path:
         raise BadInput.unknown(kind, name, known)
     module, _, attribute = path.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
+    look_here()
     try:
         holder = importlib.import_module(module)
     except (Exception, SystemExit) as error:  # whatever the user's module raises

@@ -305,14 +305,14 @@ def saved_step(path: Path) -> int:
     return next(iter(saved_steps(path / "checkpoints")), -1)
 
 
-def standing(path: Path) -> dict[str, Any]:
+def status(path: Path) -> dict[str, Any]:
     """What a run says that it is doing: phase, step, labels, success and so on; empty if nothing can be read."""
     return json_object(path / "status.json")
 
 
 def is_finished(path: Path) -> bool:
     """Whether a run says that it is finished. One that is and does not say so is found out when it is opened."""
-    return standing(path).get("phase") == "finished"
+    return status(path).get("phase") == "finished"
 
 
 def _text(value: Any) -> str:

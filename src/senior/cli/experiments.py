@@ -15,7 +15,7 @@ from senior.cli.display import stop_when_asked
 from senior.cli.shared import DONE, FAILED, INTERRUPTED
 from senior.extras import require
 from senior.options import parse
-from senior.rundir import is_finished, standing
+from senior.rundir import is_finished, status
 from senior.sweep import grid
 from senior.sweep.cells import Cell, check_cells
 from senior.types import BadInput
@@ -101,7 +101,7 @@ def run_cells(cells: Sequence[Cell], out: Path, jobs: int | None, ray: str | Non
 def _stands(cell: Cell) -> str:
     if is_finished(cell.path):
         return "finished"
-    told = standing(cell.path)
+    told = status(cell.path)
     return f"step {told['step']:,}" if "step" in told else "not begun"
 
 

@@ -7,9 +7,7 @@ by replaying them), and ``info["success"]`` or ``info["is_success"]``, if told a
 from __future__ import annotations
 
 import importlib
-import os
 import re
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, SupportsFloat
@@ -20,6 +18,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import RescaleAction, TimeLimit, TransformAction
 
 from senior.envs.numbers import BadNumber, cause, checked, finite
+from senior.processes import look_here
 from senior.types import BadInput, EnvSpec
 
 
@@ -148,8 +147,7 @@ def _constructor(name: str) -> Callable[..., Any]:
     if ":" not in name:
         return _registered(name)
     module_name, _, attribute = name.partition(":")
-    if os.getcwd() not in sys.path and "" not in sys.path:
-        sys.path.append(os.getcwd())
+    look_here()
     try:
         with _staying():
             module = importlib.import_module(module_name)

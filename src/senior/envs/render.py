@@ -19,7 +19,7 @@ import gymnasium
 import numpy as np
 
 from senior.envs.drawing import Film, NoVideo, camera, drawable, own_fps
-from senior.processes import OURS, importing_alike
+from senior.processes import PYTHON, importing_alike
 from senior.types import BadInput
 
 SIDE = 480  # pixels of a Meta-World frame
@@ -69,7 +69,7 @@ def record(request: Request, out: Path, seconds: float = 600) -> str | None:
     with tempfile.TemporaryDirectory() as folder:
         asked = Path(folder) / "request.npz"
         request.write(asked)
-        command = [*OURS, "-m", "senior.envs.render", str(asked), str(out)]
+        command = [*PYTHON, "-m", "senior.envs.render", str(asked), str(out)]
         try:
             done = subprocess.run(
                 command, env=importing_alike(), capture_output=True, text=True, timeout=seconds, check=False

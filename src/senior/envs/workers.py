@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from senior.envs.episodes import Failure, Step
-from senior.processes import OURS, importing_alike
+from senior.processes import PYTHON, importing_alike
 from senior.types import BadInput, EnvSpec
 
 PATIENCE = 120.0
@@ -78,7 +78,7 @@ class Worker:
             os.fdopen(our_orders, "wb", buffering=0),
             os.fdopen(our_answers, "rb", buffering=0),
         )
-        command = [*OURS, "-m", "senior.envs.worker", str(orders), str(answers)]
+        command = [*PYTHON, "-m", "senior.envs.worker", str(orders), str(answers)]
         self.process = subprocess.Popen(
             command,
             pass_fds=(orders, answers),

@@ -7,7 +7,7 @@ import threading
 import time
 from pathlib import Path
 
-from senior.processes import OURS, importing_alike
+from senior.processes import PYTHON, importing_alike
 
 
 class Drawing:
@@ -31,7 +31,7 @@ class Drawing:
         pause = 1.0
         while not self._over.is_set():
             began = time.monotonic()
-            command = [*OURS, "-m", "senior.label.clips", str(self.run)]
+            command = [*PYTHON, "-m", "senior.label.clips", str(self.run)]
             self._process = subprocess.Popen(command, stdin=subprocess.PIPE, env=importing_alike())
             if self._over.is_set():
                 self._process.terminate()

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from senior.extras import require
 from senior.label.address import Address, shown_host
-from senior.processes import OURS, importing_alike
+from senior.processes import PYTHON, importing_alike
 from senior.types import BAD_INPUT, BadInput
 
 SERVED = 75
@@ -121,7 +121,7 @@ class Serving:
 
     def _keep(self) -> None:
         told = json.dumps({**asdict(self._address), "owner": "trainer"})
-        command = [*OURS, "-m", "senior.label.server", str(self.run), told]
+        command = [*PYTHON, "-m", "senior.label.server", str(self.run), told]
         folder = self.run / "label"
         folder.mkdir(exist_ok=True)
         complained = ""

@@ -11,7 +11,7 @@ from typing import Any
 from senior.config import Config
 from senior.envs.metaworld import TASKS
 from senior.label.desk import Assignment, Desk
-from senior.rundir import standing
+from senior.rundir import status
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Standing:
 def trainer(run: Path) -> dict[str, Any]:
     """What the trainer is doing: phase and a sentence."""
     try:
-        told = standing(run)
+        told = status(run)
         phase, step, steps = told["phase"], told["step"], told["steps"]
     except KeyError:
         return {"phase": "starting", "text": "The run has not begun."}

@@ -37,7 +37,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from senior.label.address import is_loopback, listening_at
 from senior.label.guard import SEALED
-from senior.processes import OURS, importing_alike
+from senior.processes import PYTHON, importing_alike
 from senior.rundir import is_run
 from senior.types import BAD_INPUT, BadInput
 
@@ -153,7 +153,7 @@ class Builder:
         """Make the page once; what cannot be shown leaves the last one standing."""
         self._count += 1
         out, before = self._folder / str(self._count), self.shown
-        command = [*OURS, "-m", "senior.report.watch", str(out), *map(str, self.places)]
+        command = [*PYTHON, "-m", "senior.report.watch", str(out), *map(str, self.places)]
         # a session of its own: it is ended by us, not by the keyboard's interrupt
         self._process = subprocess.Popen(
             command,

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from senior.rundir import standing
+from senior.rundir import status
 from senior.sweep.cells import Cell
 from senior.sweep.scheduler import Sweep
 
@@ -85,7 +85,7 @@ class Board:
         stirring = [folder for folder, cells in groups.items() if set(cells) & sweep.running]
         shown = [*stirring, *(folder for folder in groups if folder not in stirring)][:room]
         for folder, cells in ((folder, cells) for folder, cells in groups.items() if folder in shown):
-            told = [standing(cell.path) for cell in cells]
+            told = [status(cell.path) for cell in cells]
             success = [one["success"] for one in told if one.get("success") is not None]
             table.add_row(
                 str(folder.relative_to(self._out) if folder.is_relative_to(self._out) else folder),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
-from senior.processes import OURS, importing_alike
+from senior.processes import PYTHON, importing_alike
 from senior.protocol import threads
 from senior.rundir import told
 from senior.sweep.cells import Done, Job, order, outcomes_of
@@ -95,7 +95,7 @@ class LocalCrew:
         orders, give = os.pipe()
         hear, answers = os.pipe()
         os.set_blocking(hear, False)
-        command = [*OURS, "-m", "senior.sweep.worker", str(orders), str(answers), str(self._threads)]
+        command = [*PYTHON, "-m", "senior.sweep.worker", str(orders), str(answers), str(self._threads)]
         with open(log, "a") as file:
             process = subprocess.Popen(
                 command,
@@ -158,7 +158,7 @@ def find_device(device: str) -> str:
     program = "import sys\nfrom senior.device import prepare_device\nfrom senior.types import BadInput\n"
     program += f"try:\n    print(prepare_device({device!r}))\nexcept BadInput as error:\n    sys.exit(str(error))\n"
     asked = subprocess.run(
-        [*OURS, "-c", program],
+        [*PYTHON, "-c", program],
         env=importing_alike(),
         capture_output=True,
         text=True,

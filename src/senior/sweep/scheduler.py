@@ -7,7 +7,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from typing import Protocol
 
-from senior.rundir import HELD, is_finished, saved_step, standing
+from senior.rundir import HELD, is_finished, saved_step, status
 from senior.sweep.cells import Cell, Done, Job, Outcome, opened_at
 
 RETRIES = 3
@@ -149,5 +149,5 @@ class Sweep:
         taken = 0
         for cell in left:
             steps = cell.config.steps
-            taken += steps if cell in self.finished else min(steps, int(standing(cell.path).get("step", 0)))
+            taken += steps if cell in self.finished else min(steps, int(status(cell.path).get("step", 0)))
         return taken, sum(cell.config.steps for cell in left)
